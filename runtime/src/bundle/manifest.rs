@@ -1,0 +1,118 @@
+//! What a bundle says about itself.
+
+use crate::spec::{ModelSpec, TrackerParams};
+use serde::{Deserialize, Serialize};
+
+/// The manifest: borrowed from the file's bytes, no allocation.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Manifest<'a> {
+    /// Name of the model, as in `nano`.
+    pub name: &'a str,
+    /// Shape of the network and preprocessing.
+    pub spec: ModelSpec,
+    /// Thresholds the model was tuned with.
+    pub tracker: TrackerParams,
+    /// Sensors the model has seen in training.
+    pub trained_on: TrainedOn,
+    /// Map from score to probability, when one was fitted.
+    pub calibration: Option<ScoreCalibration>,
+    /// Where the weights come from.
+    #[serde(borrow)]
+    pub provenance: Provenance<'a>,
+    /// Measured figures, as printed by `tsda info`.
+    pub figures: heapless::Vec<Figure<'a>, 32>,
+    /// SPDX expression or a sentence, for the weights (not the code).
+    pub licence: &'a str,
+    /// The model card, Markdown.
+    pub card: &'a str,
+    /// Where everything else is in the file.
+    pub sections: heapless::Vec<Section, 16>,
+}
+
+/// Sensors seen in training.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TrainedOn {
+    /// Visible light.
+    pub rgb: bool,
+    /// Long-wave infrared.
+    pub thermal: bool,
+    /// Templates of one sensor against searches of the other.
+    pub cross_modal: bool,
+}
+
+/// Logistic map from the score to the probability that the box is right:
+/// `1 / (1 + exp(-(slope * score + bias)))`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScoreCalibration {
+    /// Slope.
+    pub slope: f32,
+    /// Bias.
+    pub bias: f32,
+}
+
+/// How the weights were made.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Provenance<'a> {
+    /// Program and version that trained them.
+    pub trainer: &'a str,
+    /// The resolved training configuration, TOML.
+    pub config: &'a str,
+    /// Random seed of the run.
+    pub seed: u64,
+    /// Optimiser steps taken.
+    pub steps: u64,
+    /// Data sources and their licences, one per line.
+    pub data: &'a str,
+    /// CRC-32 of the weights file the bundle was built from.
+    pub weights_crc: u32,
+}
+
+/// One measured figure.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Figure<'a> {
+    /// What was measured, on what.
+    pub name: &'a str,
+    /// The value.
+    pub value: f32,
+}
+
+/// What a section holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub enum SectionKind {
+    /// ONNX graph crop -> head feature; its weights are external data in [`SectionKind::Weights`].
+    FeaturesOnnx,
+    /// ONNX graph head feature, label, ltrb -> template tokens.
+    TemplateOnnx,
+    /// ONNX graph tokens of this many templates, search feature -> score map, ltrb map.
+    PredictOnnx(u8),
+    /// Raw little-endian tensors, each 64-byte aligned; the graphs' external data.
+    Weights,
+    /// Reference outputs of the trainer's own network, see `probe`.
+    Probe,
+}
+
+impl core::fmt::Display for SectionKind {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self {
+            Self::FeaturesOnnx => f.write_str("features.onnx"),
+            Self::TemplateOnnx => f.write_str("template.onnx"),
+            Self::PredictOnnx(n) => write!(f, "predict{n}.onnx"),
+            Self::Weights => f.write_str(super::WEIGHTS_FILE),
+            Self::Probe => f.write_str("probe.bin"),
+        }
+    }
+}
+
+/// One entry of the table of contents.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Section {
+    /// What it holds.
+    pub kind: SectionKind,
+    /// Start, in bytes from the start of the file; a multiple of 64.
+    pub offset: u64,
+    /// Length in bytes.
+    pub length: u64,
+    /// CRC-32 (IEEE) of the bytes.
+    pub crc: u32,
+}
