@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# Runs every test of the workspace. Where Python is found, the packages that check our ONNX files
+# from outside (onnx, onnxruntime) are installed once into target/py; without Python or network the
+# tests that need them say "skipped" and the rest runs all the same.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+target="${CARGO_TARGET_DIR:-target}"
+venv="$target/py"
+want="onnx>=1.17 onnxruntime>=1.20 numpy"
+
+prepare_python() {
+  command -v python3 >/dev/null || { echo "python3 not found: the ONNX checks from Python are skipped"; return 1; }
+  if [ -x "$venv/bin/python" ] && "$venv/bin/python" -c 'import onnx, onnxruntime, numpy' 2>/dev/null; then
+    return 0
+  fi
+  mkdir -p "$target"
+  rm -rf "$venv"
+  python3 -m venv "$venv" >/dev/null 2>&1 || { echo "python3 has no venv module: the ONNX checks from Python are skipped"; return 1; }
+  # shellcheck disable=SC2086
+  "$venv/bin/python" -m pip install --quiet $want || { echo "pip could not install '$want' (offline?): the ONNX checks from Python are skipped"; rm -rf "$venv"; return 1; }
+}
+
+if prepare_python; then
+  TSDA_PYTHON="$(cd "$(dirname "$venv")" && pwd)/py/bin/python"
+  export TSDA_PYTHON
+fi
+
+exec cargo test --workspace --locked "$@"
