@@ -1,4 +1,15 @@
 //! Dataset loaders behind one trait.
+//!
+//! [`open`] reads `kind:path[@split]` texts as they stand in configurations and on command lines;
+//! [`pairs`] and [`sequences`] hold the loaders for registered stills and LasHeR-like clips.
+
+mod open;
+pub mod pairs;
+mod picture;
+pub mod sequences;
+
+pub use open::{Dataset, OpenError, Split, UnknownSplit, open};
+pub use picture::{decode_picture, natural_cmp};
 
 use tsda_runtime::{BBox, FrameError, FrameView, Modality, PixelFormat};
 
