@@ -106,6 +106,29 @@ impl BBox {
     }
 }
 
+/// A position or offset, vertical first: the order of the specification's image quantities.
+/// Positions of the tracker are pixel-**centre** coordinates: pixel 0 is at 0, its left edge at -0.5
+/// (spec 3).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Yx {
+    /// Vertical, downwards.
+    pub y: f32,
+    /// Horizontal, to the right.
+    pub x: f32,
+}
+
+impl Yx {
+    /// From vertical and horizontal.
+    pub const fn new(y: f32, x: f32) -> Self {
+        Self { y, x }
+    }
+
+    /// The same function on both components.
+    pub(crate) fn map(self, f: impl Fn(f32) -> f32) -> Self {
+        Self { y: f(self.y), x: f(self.x) }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -17,9 +17,13 @@ pub mod bundle;
 pub mod engine;
 pub mod frame;
 pub mod geometry;
+pub mod labels;
+pub mod probe;
 pub mod spec;
+#[cfg(test)]
+mod testing;
 
 pub use engine::{Engine, EngineError};
 pub use frame::{FrameError, FrameView, PixelFormat};
-pub use geometry::{BBox, Modality};
+pub use geometry::{BBox, Modality, Yx};
 pub use spec::{Backbone, ModelSpec, SpecError, TrackerParams};

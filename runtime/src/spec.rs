@@ -68,6 +68,9 @@ pub struct ModelSpec {
     pub input_std: [f32; 3],
 }
 
+/// Most template slots a network of the family can have.
+pub const MAX_TEMPLATES: usize = 8;
+
 /// ImageNet statistics, as in ToMP (spec 1.1).
 pub const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 /// See [`IMAGENET_MEAN`].
@@ -180,7 +183,7 @@ impl ModelSpec {
                 return bad(field, 0.0, "at least 1");
             }
         }
-        if !(1..=8).contains(&self.templates) {
+        if !(1..=MAX_TEMPLATES).contains(&self.templates.into()) {
             return bad("templates", self.templates.into(), "1 to 8");
         }
         if !(self.label_sigma.is_finite() && self.label_sigma > 0.0) {
