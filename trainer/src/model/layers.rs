@@ -1,0 +1,205 @@
+//! Layers both backbones and the head are made of.
+//!
+//! All of them run unchanged on a plain, an autodiff and a capture device. Convolution weights are
+//! kept in PyTorch's layout `(out, in / groups, k, k)`.
+
+use burn::module::Param;
+use burn::prelude::*;
+use burn::tensor::Distribution;
+use burn::tensor::module::conv2d;
+use burn::tensor::ops::ConvOptions;
+
+/// Zero padding of one spatial axis, `(before, after)`.
+pub(crate) type Pad = (usize, usize);
+
+/// Shape-independent settings of a convolution; the same for rows and columns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Geometry {
+    /// Side of the kernel.
+    pub kernel: usize,
+    /// Stride.
+    pub stride: usize,
+    /// Padding.
+    pub pad: Pad,
+    /// Groups; the channel count for a depthwise convolution.
+    pub groups: usize,
+}
+
+impl Geometry {
+    /// Padding `kernel / 2` on both sides, as in PyTorch's ResNet.
+    pub const fn centred(kernel: usize, stride: usize) -> Self {
+        Self { kernel, stride, pad: (kernel / 2, kernel / 2), groups: 1 }
+    }
+
+    /// TensorFlow "SAME": at stride 2 on even sides the odd pixel of padding goes behind.
+    pub const fn same(kernel: usize, stride: usize, groups: usize) -> Self {
+        let total = kernel - stride;
+        Self { kernel, stride, pad: (total / 2, total - total / 2), groups }
+    }
+
+    fn options(&self) -> ConvOptions<2> {
+        ConvOptions::new_with_padding([self.stride; 2], [self.pad; 2], [1; 2], self.groups)
+    }
+}
+
+/// A trainable tensor with values uniform in `[-bound, bound)`.
+pub(crate) fn uniform<const D: usize>(
+    shape: [usize; D],
+    bound: f64,
+    device: &Device,
+) -> Param<Tensor<D>> {
+    Param::from_tensor(Tensor::random(shape, Distribution::Uniform(-bound, bound), device))
+}
+
+/// A trainable tensor filled with one value.
+pub(crate) fn filled<const D: usize>(
+    shape: [usize; D],
+    value: f32,
+    device: &Device,
+) -> Param<Tensor<D>> {
+    Param::from_tensor(Tensor::full(shape, value, device))
+}
+
+/// Bare convolution, with or without bias.
+#[derive(Module, Debug)]
+pub(crate) struct Conv {
+    /// `(out, in / groups, k, k)`.
+    pub weight: Param<Tensor<4>>,
+    /// `(out)`.
+    pub bias: Option<Param<Tensor<1>>>,
+    #[module(skip)]
+    geometry: Geometry,
+}
+
+impl Conv {
+    /// PyTorch's default initialisation: uniform +-1/sqrt(fan in) for weight and bias.
+    pub fn new(inp: usize, out: usize, geometry: Geometry, bias: bool, device: &Device) -> Self {
+        let Geometry { kernel, groups, .. } = geometry;
+        let bound = 1.0 / ((inp / groups * kernel * kernel) as f64).sqrt();
+        Self {
+            weight: uniform([out, inp / groups, kernel, kernel], bound, device),
+            bias: bias.then(|| uniform([out], bound, device)),
+            geometry,
+        }
+    }
+
+    /// `(B, in, H, W)` to `(B, out, H', W')`.
+    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        let bias = self.bias.as_ref().map(Param::val);
+        conv2d(x, self.weight.val(), bias, self.geometry.options())
+    }
+}
+
+/// What follows a convolution.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Activation {
+    /// Nothing.
+    Identity,
+    /// `max(x, 0)`.
+    Relu,
+    /// `min(max(x, 0), 6)`.
+    Relu6,
+}
+
+impl Activation {
+    /// Applies it element by element.
+    pub fn apply<const D: usize>(self, x: Tensor<D>) -> Tensor<D> {
+        match self {
+            Self::Identity => x,
+            Self::Relu => burn::tensor::activation::relu(x),
+            Self::Relu6 => x.clamp(0.0, 6.0),
+        }
+    }
+}
+
+/// Batch norm whose statistics never change (spec 2.6): an affine map per channel.
+#[derive(Module, Debug)]
+pub(crate) struct FrozenBatchNorm {
+    /// Scale; trainable unless its block is frozen.
+    pub weight: Param<Tensor<1>>,
+    /// Shift; trainable unless its block is frozen.
+    pub bias: Param<Tensor<1>>,
+    /// Never trained.
+    pub running_mean: Param<Tensor<1>>,
+    /// Never trained.
+    pub running_var: Param<Tensor<1>>,
+    epsilon: f64,
+}
+
+impl FrozenBatchNorm {
+    /// Identity statistics.
+    pub fn new(channels: usize, epsilon: f64, device: &Device) -> Self {
+        Self {
+            weight: filled([channels], 1.0, device),
+            bias: filled([channels], 0.0, device),
+            running_mean: filled([channels], 0.0, device).set_require_grad(false),
+            running_var: filled([channels], 1.0, device).set_require_grad(false),
+            epsilon,
+        }
+    }
+}
+
+/// Runs a convolution with the frozen batch norm behind it, folded into its weights.
+///
+/// Folding is exact, saves a pass over every activation in training, and leaves nothing but a
+/// biased convolution per layer once the exporter has folded the constants. `on_graph` false takes
+/// the parameters out of autodiff, so that a frozen layer records nothing.
+pub(crate) fn conv_bn(
+    conv: &Conv,
+    bn: &FrozenBatchNorm,
+    activation: Activation,
+    on_graph: bool,
+    x: Tensor<4>,
+) -> Tensor<4> {
+    let (weight, bias) = fold(conv, bn, on_graph);
+    activation.apply(conv2d(x, weight, Some(bias), conv.geometry.options()))
+}
+
+/// Weight and bias of the convolution that equals `bn` after `conv`.
+fn fold(conv: &Conv, bn: &FrozenBatchNorm, on_graph: bool) -> (Tensor<4>, Tensor<1>) {
+    let (weight, gamma, beta) = (conv.weight.val(), bn.weight.val(), bn.bias.val());
+    let (weight, gamma, beta) = if on_graph {
+        (weight, gamma, beta)
+    } else {
+        (weight.inner(), gamma.inner(), beta.inner())
+    };
+    let deviation = bn.running_var.val().inner().add_scalar(bn.epsilon).sqrt();
+    let scale = gamma / deviation;
+    let bias = beta - scale.clone() * bn.running_mean.val().inner();
+    let out = weight.dims()[0];
+    (weight * scale.reshape([out, 1, 1, 1]), bias)
+}
+
+/// Parameter-free norm of the head feature (spec 1.3): RMS over `(C, H, W)` becomes
+/// `sqrt(1 / (C k^2))`, image by image.
+pub(crate) fn instance_l2_norm(x: Tensor<4>, filter_size: usize) -> Tensor<4> {
+    let [b, c, h, w] = x.dims();
+    let count = c * h * w;
+    let scale = (1.0 / (c * filter_size * filter_size) as f64).sqrt();
+    let flat = x.reshape([b, count]);
+    let energy = flat.clone().powi_scalar(2).sum_dim(1).add_scalar(1e-5);
+    // s * sqrt(n / e), written with one square root and one division.
+    let factor = energy.sqrt().recip().mul_scalar(scale * (count as f64).sqrt());
+    (flat * factor).reshape([b, c, h, w])
+}
+
+/// The fixed positional code of one frame, `(side * side, width)` row-major (spec 1.5, with the
+/// map's side as `maxres`).
+pub(crate) fn positional_code(side: usize, width: usize) -> Vec<f32> {
+    let frequencies = width / 4;
+    let phi = side as f64 / frequencies as f64;
+    let centre = |i: usize| ((i as f32) + 0.5) / (side as f32 + 1e-6);
+    let mut code = vec![0.0; side * side * width];
+    for (cell, token) in code.chunks_exact_mut(width).enumerate() {
+        let (y, x) = (centre(cell / side), centre(cell % side));
+        for i in 0..frequencies {
+            // Formed in double, rounded once, as the reference does.
+            let omega = ((i + 1) as f64 * phi * std::f64::consts::PI) as f32;
+            token[2 * i] = (omega * x).sin();
+            token[2 * i + 1] = (omega * y).sin();
+            token[2 * (frequencies + i)] = (omega * x).cos();
+            token[2 * (frequencies + i) + 1] = (omega * y).cos();
+        }
+    }
+    code
+}
