@@ -1,0 +1,385 @@
+//! One TOML file that fixes a training run, from the network to the last seed.
+//!
+//! Every table refuses unknown keys and every value is checked before anything is read or written,
+//! so a typing mistake costs a second and not an hour. [`Experiment::load`] names the file, the
+//! line and the field. The resolved copy (presets expanded, paths made concrete, overrides applied)
+//! is written beside the results with [`Experiment::to_toml`].
+
+mod load;
+mod model;
+mod validate;
+
+pub use load::ConfigError;
+pub use model::ModelConfig;
+pub use validate::FieldError;
+
+use crate::model::FreezePolicy;
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+use tsda_runtime::{ModelSpec, SpecError, TrackerParams};
+
+/// Everything a training run depends on.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Experiment {
+    /// The network.
+    pub model: ModelConfig,
+    /// Thresholds of the online tracker; training does not read them, bundles carry them.
+    pub tracker: TrackerParams,
+    /// Where samples come from; at least one entry.
+    pub data: Vec<DataSource>,
+    /// How frames, targets and sensors are drawn.
+    pub sampler: SamplerConfig,
+    /// How drawn frames become network input.
+    pub processing: ProcessingConfig,
+    /// Weights of the two losses.
+    pub loss: LossConfig,
+    /// Optimiser, learning rates, freezing.
+    pub optim: OptimConfig,
+    /// Weights to start from.
+    pub init: InitConfig,
+    /// Length, seed, checkpoints, logs.
+    pub run: RunConfig,
+}
+
+/// Layout of a data source.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DataKind {
+    /// Registered RGB/thermal stills with an `index.json`.
+    Pairs,
+    /// Clips in LasHeR's layout with an `index.json`.
+    Sequences,
+}
+
+/// One set of sequences to draw from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DataSource {
+    /// Layout of the folder.
+    pub kind: DataKind,
+    /// The folder; relative paths are tried beside the configuration file, then from the current
+    /// folder.
+    pub path: PathBuf,
+    /// Split trained on.
+    #[serde(default = "train_split")]
+    pub split: String,
+    /// Split validated on; an empty string leaves the source out of validation.
+    #[serde(default = "val_split")]
+    pub validation_split: String,
+    /// Relative frequency among the sources.
+    #[serde(default = "one")]
+    pub weight: f64,
+}
+
+fn train_split() -> String {
+    "train".into()
+}
+fn val_split() -> String {
+    "val".into()
+}
+fn one() -> f64 {
+    1.0
+}
+
+/// How frames, targets and sensors are drawn (spec 2.1 and the paper's modality rule).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SamplerConfig {
+    /// Template frames per sample; all of one sensor.
+    pub templates: usize,
+    /// Chance that the search frame comes from the other sensor.
+    pub cross_modal_p: f64,
+    /// Share of samples whose target is a random textured region of a registered pair instead of
+    /// an annotated box.
+    pub random_region_p: f64,
+    /// Smallest side of a random region in pixels.
+    pub region_min: f32,
+    /// Largest side of a random region in pixels (and never above half the picture's short side).
+    pub region_max: f32,
+    /// A region counts as textured when, in every sensor, its mean gradient is at least this share
+    /// of the picture's.
+    pub region_texture: f32,
+    /// Annotated boxes with a smaller `sqrt(w h)` are not used, in pixels.
+    pub min_target: f32,
+    /// Largest distance in frames between the base template and any other frame of a video.
+    pub gap: usize,
+    /// Samples that count as one epoch.
+    pub samples_per_epoch: usize,
+}
+
+impl Default for SamplerConfig {
+    fn default() -> Self {
+        Self {
+            templates: 2,
+            cross_modal_p: 0.5,
+            random_region_p: 0.3,
+            region_min: 20.0,
+            region_max: 160.0,
+            region_texture: 0.8,
+            min_target: 8.0,
+            gap: 200,
+            samples_per_epoch: 4000,
+        }
+    }
+}
+
+/// Jitter of the box a crop is cut around (spec 2.3).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct JitterConfig {
+    /// `sj`: standard deviation of the logarithm of width and height.
+    pub scale: f32,
+    /// `cj`: the centre moves by up to half of this, in units of `sqrt(w h)`, per axis.
+    pub centre: f32,
+    /// Standard deviation of the logarithm of the crop's stretch (x against y). The reference has
+    /// none; stills, where nothing else moves, profit from a little.
+    pub aspect: f32,
+}
+
+impl Default for JitterConfig {
+    fn default() -> Self {
+        Self { scale: 0.5, centre: 4.5, aspect: 0.0 }
+    }
+}
+
+/// From a drawn frame to network input (spec 2.2, 2.3).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ProcessingConfig {
+    /// Jitter of template crops.
+    pub template: JitterConfig,
+    /// Jitter of search crops.
+    pub search: JitterConfig,
+    /// Largest factor by which a crop may shrink to stay inside the picture.
+    pub max_scale_change: f32,
+    /// Chance that the whole sample is mirrored.
+    pub joint_flip_p: f64,
+    /// Chance that one crop is mirrored on its own.
+    pub crop_flip_p: f64,
+    /// Chance that the sample's RGB pictures turn grey.
+    pub grayscale_p: f64,
+    /// Brightness factor is uniform in `1 +- brightness`.
+    pub brightness: f32,
+    /// Photometric changes of RGB crops.
+    pub rgb: PhotometricConfig,
+    /// Photometric changes of thermal crops.
+    pub thermal: PhotometricConfig,
+    /// Decoded pictures kept in memory, in MiB.
+    pub cache_mib: usize,
+}
+
+impl Default for ProcessingConfig {
+    fn default() -> Self {
+        Self {
+            template: JitterConfig { scale: 0.0, centre: 0.0, aspect: 0.0 },
+            search: JitterConfig::default(),
+            max_scale_change: 1.5,
+            joint_flip_p: 0.5,
+            crop_flip_p: 0.5,
+            grayscale_p: 0.05,
+            brightness: 0.2,
+            rgb: PhotometricConfig::default(),
+            thermal: PhotometricConfig::default(),
+            cache_mib: 1024,
+        }
+    }
+}
+
+/// Changes of grey values of one sensor; all off by default, as in the reference.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PhotometricConfig {
+    /// Gamma is `exp(U(-gamma, gamma))`.
+    pub gamma: f32,
+    /// Contrast factor around the crop's mean is `exp(U(-contrast, contrast))`.
+    pub contrast: f32,
+    /// Chance that grey values are inverted (white-hot / black-hot), once per sample and sensor.
+    pub invert_p: f64,
+    /// Chance of a Gaussian blur.
+    pub blur_p: f64,
+    /// Largest standard deviation of the blur, in crop pixels.
+    pub blur_sigma: f32,
+    /// Chance of added Gaussian noise.
+    pub noise_p: f64,
+    /// Largest standard deviation of the noise, in grey levels of 0..255.
+    pub noise_sigma: f32,
+}
+
+/// Loss weights (spec 2.5).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LossConfig {
+    /// Weight of the classification loss.
+    pub cls: f64,
+    /// Weight of the box loss.
+    pub reg: f64,
+}
+
+impl Default for LossConfig {
+    fn default() -> Self {
+        Self { cls: 100.0, reg: 1.0 }
+    }
+}
+
+/// How the learning rate falls after the warm-up.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "snake_case", tag = "kind")]
+pub enum ScheduleConfig {
+    /// Never.
+    Constant,
+    /// Times `gamma` at each of these shares of the run.
+    Step {
+        /// Shares of the run, in `(0, 1)`, rising.
+        at: Vec<f64>,
+        /// Factor per step.
+        gamma: f64,
+    },
+    /// Half a cosine from 1 to `floor`.
+    Cosine {
+        /// Share of the starting rate left at the end.
+        #[serde(default)]
+        floor: f64,
+    },
+}
+
+/// AdamW, learning rates, freezing (spec 2.6, 2.7).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OptimConfig {
+    /// Learning rate of everything but the backbone.
+    pub lr_head: f64,
+    /// Learning rate of the backbone.
+    pub lr_backbone: f64,
+    /// Decoupled weight decay, on every parameter.
+    pub weight_decay: f64,
+    /// Added to the root of the second moment.
+    pub eps: f64,
+    /// Decay of the first moment.
+    pub beta1: f64,
+    /// Decay of the second moment.
+    pub beta2: f64,
+    /// Steps over which the rates rise linearly from zero.
+    pub warmup_steps: u64,
+    /// After the warm-up.
+    pub schedule: ScheduleConfig,
+    /// Largest norm of all gradients together; 0 switches clipping off.
+    pub clip_norm: f64,
+    /// Decay of the running average of the weights; 0 switches it off. Validation and the final
+    /// model use the average.
+    pub ema_decay: f64,
+    /// Leading layers of the backbone that stay as they are: `"before_stride16"`, `"all"`,
+    /// `"none"` or `{ leading = 3 }`.
+    pub freeze: FreezePolicy,
+    /// Share of transformer activations dropped.
+    pub dropout: f64,
+    /// Share of attention weights dropped.
+    pub attention_dropout: f64,
+}
+
+impl Default for OptimConfig {
+    fn default() -> Self {
+        Self {
+            lr_head: 1e-4,
+            lr_backbone: 2e-5,
+            weight_decay: 1e-4,
+            eps: 1e-8,
+            beta1: 0.9,
+            beta2: 0.999,
+            warmup_steps: 0,
+            schedule: ScheduleConfig::Cosine { floor: 0.01 },
+            clip_norm: 0.0,
+            ema_decay: 0.0,
+            freeze: FreezePolicy::default(),
+            dropout: 0.1,
+            attention_dropout: 0.1,
+        }
+    }
+}
+
+/// Weights to start from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct InitConfig {
+    /// Backbone weights (`.safetensors`), or `"scratch"` for random ones.
+    pub backbone: String,
+    /// Weights of a whole network of the same specification to go on from; empty for none.
+    pub weights: String,
+}
+
+/// Value of [`InitConfig::backbone`] that asks for random weights.
+pub const SCRATCH: &str = "scratch";
+
+impl Default for InitConfig {
+    fn default() -> Self {
+        Self { backbone: SCRATCH.into(), weights: String::new() }
+    }
+}
+
+/// Length, seed, checkpoints, logs.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RunConfig {
+    /// Optimiser steps; when 0, `epochs` decides.
+    pub steps: u64,
+    /// Epochs of `sampler.samples_per_epoch` samples, used when `steps` is 0.
+    pub epochs: u64,
+    /// Samples per step.
+    pub batch: usize,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Threads that prepare batches.
+    pub workers: usize,
+    /// Folder for checkpoints, logs and the final model.
+    pub out: PathBuf,
+    /// Steps between checkpoints.
+    pub checkpoint_every: u64,
+    /// Checkpoints kept.
+    pub keep: usize,
+    /// Steps between log entries.
+    pub log_every: u64,
+    /// Steps between validations; 0 for none.
+    pub validate_every: u64,
+    /// Samples per validation; the same ones every time.
+    pub validation_samples: usize,
+}
+
+impl Default for RunConfig {
+    fn default() -> Self {
+        Self {
+            steps: 0,
+            epochs: 1,
+            batch: 16,
+            seed: 1,
+            workers: 2,
+            out: PathBuf::from("out"),
+            checkpoint_every: 500,
+            keep: 3,
+            log_every: 10,
+            validate_every: 500,
+            validation_samples: 128,
+        }
+    }
+}
+
+impl Experiment {
+    /// The network, preset and overrides put together.
+    ///
+    /// # Errors
+    /// When the preset is unknown or a field is out of range.
+    pub fn model_spec(&self) -> Result<ModelSpec, SpecError> {
+        self.model.spec()
+    }
+
+    /// Optimiser steps of the whole run.
+    pub fn total_steps(&self) -> u64 {
+        if self.run.steps > 0 {
+            return self.run.steps;
+        }
+        let samples = self.run.epochs.saturating_mul(self.sampler.samples_per_epoch as u64);
+        samples.div_ceil(self.run.batch.max(1) as u64)
+    }
+}
+
+#[cfg(test)]
+mod tests;

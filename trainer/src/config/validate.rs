@@ -1,0 +1,195 @@
+//! Range checks of every field, each naming the field as it is written in the file.
+
+use super::{
+    DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig, ProcessingConfig,
+    RunConfig, SamplerConfig, ScheduleConfig,
+};
+use tsda_eval::dataset::Split;
+use tsda_runtime::SpecError;
+
+/// A field whose value cannot be used.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("{field} = {value} cannot be used: it must be {want}")]
+pub struct FieldError {
+    /// Dotted name of the field, array entries counted from 0 (`data.0.weight`).
+    pub field: String,
+    /// Its value.
+    pub value: String,
+    /// What it may be.
+    pub want: String,
+}
+
+fn fail<T>(field: &str, value: impl ToString, want: &str) -> Result<T, FieldError> {
+    Err(FieldError { field: field.into(), value: value.to_string(), want: want.into() })
+}
+
+fn within(field: &str, value: f64, low: f64, high: f64) -> Result<(), FieldError> {
+    if value.is_finite() && (low..=high).contains(&value) {
+        return Ok(());
+    }
+    fail(field, value, &format!("a finite number from {low} to {high}"))
+}
+
+fn share(field: &str, value: f64) -> Result<(), FieldError> {
+    within(field, value, 0.0, 1.0)
+}
+
+fn positive(field: &str, value: f64) -> Result<(), FieldError> {
+    if value.is_finite() && value > 0.0 {
+        return Ok(());
+    }
+    fail(field, value, "a finite number above 0")
+}
+
+fn count(field: &str, value: u64, low: u64, high: u64) -> Result<(), FieldError> {
+    if (low..=high).contains(&value) {
+        return Ok(());
+    }
+    fail(field, value, &format!("a whole number from {low} to {high}"))
+}
+
+fn from_spec(table: &str, e: SpecError) -> FieldError {
+    // An unknown preset has no number to show.
+    let value = if e.field == "preset" { "(unknown name)".into() } else { e.value.to_string() };
+    FieldError { field: format!("{table}.{}", e.field), value, want: e.want.into() }
+}
+
+impl Experiment {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// Names the first field that is out of range, its value and the range.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        let spec = self.model.spec().map_err(|e| from_spec("model", e))?;
+        self.tracker.validate().map_err(|e| from_spec("tracker", e))?;
+        if self.data.is_empty() {
+            return fail("data", "[]", "at least one [[data]] table");
+        }
+        for (i, source) in self.data.iter().enumerate() {
+            check_source(i, source)?;
+        }
+        check_sampler(&self.sampler)?;
+        if self.sampler.templates > usize::from(spec.templates) {
+            return fail(
+                "sampler.templates",
+                self.sampler.templates,
+                &format!("at most model.templates = {}", spec.templates),
+            );
+        }
+        check_processing(&self.processing)?;
+        within("loss.cls", self.loss.cls, 0.0, 1e6)?;
+        within("loss.reg", self.loss.reg, 0.0, 1e6)?;
+        check_optim(&self.optim)?;
+        if self.init.backbone.is_empty() {
+            return fail("init.backbone", "\"\"", "a path or \"scratch\"");
+        }
+        check_run(&self.run)?;
+        count("run.steps (or run.epochs)", self.total_steps(), 1, 100_000_000)
+    }
+}
+
+fn check_source(i: usize, source: &DataSource) -> Result<(), FieldError> {
+    positive(&format!("data.{i}.weight"), source.weight)?;
+    for (field, name, optional) in
+        [("split", &source.split, false), ("validation_split", &source.validation_split, true)]
+    {
+        if !(optional && name.is_empty()) && name.parse::<Split>().is_err() {
+            return fail(
+                &format!("data.{i}.{field}"),
+                format!("{name:?}"),
+                "\"train\", \"val\", \"test\" or \"all\"",
+            );
+        }
+    }
+    if source.path.as_os_str().is_empty() {
+        return fail(&format!("data.{i}.path"), "\"\"", "the path of a folder");
+    }
+    Ok(())
+}
+
+fn check_sampler(s: &SamplerConfig) -> Result<(), FieldError> {
+    count("sampler.templates", s.templates as u64, 1, 8)?;
+    share("sampler.cross_modal_p", s.cross_modal_p)?;
+    share("sampler.random_region_p", s.random_region_p)?;
+    within("sampler.region_min", s.region_min.into(), 4.0, 4096.0)?;
+    within("sampler.region_max", s.region_max.into(), s.region_min.into(), 4096.0)?;
+    within("sampler.region_texture", s.region_texture.into(), 0.0, 10.0)?;
+    within("sampler.min_target", s.min_target.into(), 1.0, 4096.0)?;
+    count("sampler.gap", s.gap as u64, 1, 1_000_000)?;
+    count("sampler.samples_per_epoch", s.samples_per_epoch as u64, 1, 1_000_000_000)
+}
+
+fn check_jitter(name: &str, j: &JitterConfig) -> Result<(), FieldError> {
+    within(&format!("processing.{name}.scale"), j.scale.into(), 0.0, 2.0)?;
+    within(&format!("processing.{name}.centre"), j.centre.into(), 0.0, 20.0)?;
+    within(&format!("processing.{name}.aspect"), j.aspect.into(), 0.0, 1.0)
+}
+
+fn check_photometric(name: &str, p: &PhotometricConfig) -> Result<(), FieldError> {
+    within(&format!("processing.{name}.gamma"), p.gamma.into(), 0.0, 2.0)?;
+    within(&format!("processing.{name}.contrast"), p.contrast.into(), 0.0, 2.0)?;
+    share(&format!("processing.{name}.invert_p"), p.invert_p)?;
+    share(&format!("processing.{name}.blur_p"), p.blur_p)?;
+    within(&format!("processing.{name}.blur_sigma"), p.blur_sigma.into(), 0.0, 10.0)?;
+    share(&format!("processing.{name}.noise_p"), p.noise_p)?;
+    within(&format!("processing.{name}.noise_sigma"), p.noise_sigma.into(), 0.0, 128.0)
+}
+
+fn check_processing(p: &ProcessingConfig) -> Result<(), FieldError> {
+    check_jitter("template", &p.template)?;
+    check_jitter("search", &p.search)?;
+    within("processing.max_scale_change", p.max_scale_change.into(), 1.0, 10.0)?;
+    share("processing.joint_flip_p", p.joint_flip_p)?;
+    share("processing.crop_flip_p", p.crop_flip_p)?;
+    share("processing.grayscale_p", p.grayscale_p)?;
+    within("processing.brightness", p.brightness.into(), 0.0, 0.9)?;
+    check_photometric("rgb", &p.rgb)?;
+    check_photometric("thermal", &p.thermal)?;
+    count("processing.cache_mib", p.cache_mib as u64, 1, 1 << 20)
+}
+
+fn check_optim(o: &OptimConfig) -> Result<(), FieldError> {
+    within("optim.lr_head", o.lr_head, 0.0, 1.0)?;
+    within("optim.lr_backbone", o.lr_backbone, 0.0, 1.0)?;
+    within("optim.weight_decay", o.weight_decay, 0.0, 1.0)?;
+    positive("optim.eps", o.eps)?;
+    within("optim.eps", o.eps, 0.0, 1e-2)?;
+    within("optim.beta1", o.beta1, 0.0, 0.9999)?;
+    within("optim.beta2", o.beta2, 0.0, 0.999_999)?;
+    within("optim.clip_norm", o.clip_norm, 0.0, 1e6)?;
+    within("optim.ema_decay", o.ema_decay, 0.0, 0.999_999)?;
+    match &o.schedule {
+        ScheduleConfig::Constant => {}
+        ScheduleConfig::Step { at, gamma } => {
+            within("optim.schedule.gamma", *gamma, 0.0, 1.0)?;
+            let rising = at.windows(2).all(|w| w[0] < w[1]);
+            if !rising || at.iter().any(|v| !(v.is_finite() && *v > 0.0 && *v < 1.0)) {
+                return fail(
+                    "optim.schedule.at",
+                    format!("{at:?}"),
+                    "rising numbers between 0 and 1",
+                );
+            }
+        }
+        ScheduleConfig::Cosine { floor } => share("optim.schedule.floor", *floor)?,
+    }
+    within("optim.dropout", o.dropout, 0.0, 0.95)?;
+    within("optim.attention_dropout", o.attention_dropout, 0.0, 0.95)?;
+    Ok(())
+}
+
+fn check_run(r: &RunConfig) -> Result<(), FieldError> {
+    count("run.batch", r.batch as u64, 1, 4096)?;
+    count("run.workers", r.workers as u64, 1, 256)?;
+    count("run.checkpoint_every", r.checkpoint_every, 1, u64::MAX)?;
+    count("run.keep", r.keep as u64, 1, 10_000)?;
+    count("run.log_every", r.log_every, 1, u64::MAX)?;
+    if r.validate_every > 0 {
+        count("run.validation_samples", r.validation_samples as u64, 1, 1_000_000)?;
+    }
+    if r.out.as_os_str().is_empty() {
+        return fail("run.out", "\"\"", "the path of a folder");
+    }
+    // TOML has no unsigned 64-bit numbers; the resolved copy could not hold a larger one.
+    count("run.seed", r.seed, 0, i64::MAX as u64)
+}
