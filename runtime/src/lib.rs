@@ -14,6 +14,7 @@
 #![cfg_attr(not(any(feature = "std", test)), no_std)]
 
 pub mod bundle;
+pub mod crop;
 pub mod engine;
 pub mod frame;
 pub mod geometry;
