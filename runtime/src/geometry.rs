@@ -122,11 +122,6 @@ impl Yx {
     pub const fn new(y: f32, x: f32) -> Self {
         Self { y, x }
     }
-
-    /// The same function on both components.
-    pub(crate) fn map(self, f: impl Fn(f32) -> f32) -> Self {
-        Self { y: f(self.y), x: f(self.x) }
-    }
 }
 
 #[cfg(test)]

@@ -19,12 +19,18 @@ pub mod engine;
 pub mod frame;
 pub mod geometry;
 pub mod labels;
+pub mod localise;
+pub mod memory;
 pub mod probe;
 pub mod spec;
 #[cfg(test)]
 mod testing;
+pub mod tracker;
 
 pub use engine::{Engine, EngineError};
 pub use frame::{FrameError, FrameView, PixelFormat};
 pub use geometry::{BBox, Modality, Yx};
+pub use localise::Flag;
+pub use memory::TemplateMemory;
 pub use spec::{Backbone, ModelSpec, SpecError, TrackerParams};
+pub use tracker::{BoxError, Track, TrackError, TrackState, Tracker};

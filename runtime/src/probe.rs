@@ -30,6 +30,7 @@ const HEADER: usize = 12;
 /// A probe section that cannot be read or run.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
+#[expect(clippy::large_enum_variant, reason = "an engine's message is inside, there is no heap")]
 pub enum ProbeError {
     /// The section does not start as a probe does.
     #[error("probe section: unknown signature; export the bundle again")]

@@ -312,7 +312,8 @@ mod tests {
 
     #[test]
     fn a_bad_field_is_named() {
-        let cases: [(&str, fn(&mut ModelSpec)); 7] = [
+        type Change = fn(&mut ModelSpec);
+        let cases: [(&str, Change); 7] = [
             ("crop", |s| s.crop = 150),
             ("search_factor", |s| s.search_factor = f32::NAN),
             ("heads", |s| s.heads = 5),

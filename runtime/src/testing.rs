@@ -48,6 +48,7 @@ pub fn recipe(index: usize, width: usize, height: usize) -> Vec<u8> {
 }
 
 /// Answers `predict` with the maps it was given, keeps everything written to it.
+#[derive(Debug)]
 pub struct ScriptedEngine {
     pub spec: ModelSpec,
     pub crop: Vec<f32>,
