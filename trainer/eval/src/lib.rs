@@ -1,6 +1,53 @@
 //! Datasets, protocols and metrics for cross-modal tracking, without a training framework.
 //!
 //! * [`dataset`]: one [`dataset::Sequence`] trait over every folder layout; frames decoded lazily.
-//! * the trainer's sampler reads the same loaders, and `tsda eval` runs bundles over them.
+//!   The trainer's sampler reads the same loaders.
+//! * [`pseudo`]: clips with exact truth out of registered stills.
+//! * [`protocol`]: which sensor a frame comes from (`rgb2t`, `t2rgb`, `switch:20`, ..), and
+//!   [`protocol::TrackerUnderTest`], what can be evaluated.
+//! * [`evaluate()`]: a whole dataset, several sequences at a time; the same figures on any number of
+//!   threads.
+//! * [`metrics`]: SR@0.5, success AUC, PR@20, normalised precision, mean IoU.
+//! * [`baselines`]: a static box and template matching, what a tracker has to beat.
+//! * [`summary`], [`otb`]: JSON, Markdown and OTB text.
+//!
+//! # Example
+//! ```no_run
+//! use tsda_eval::baselines::StaticBox;
+//! use tsda_eval::protocol::Protocol;
+//! use tsda_eval::summary::{Summary, markdown};
+//! use tsda_eval::{Options, dataset, evaluate};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let data = dataset::open("pseudo:data/pairs@val")?;
+//! let mut runs = Vec::new();
+//! for protocol in Protocol::CROSS_MODAL {
+//!     runs.push(evaluate(
+//!         &data,
+//!         protocol,
+//!         &|| Ok(Box::new(StaticBox::default())),
+//!         Options { threads: 2, ..Options::default() },
+//!         &|p| eprintln!("{}/{} {}: {:.2}", p.done, p.total, p.result.label(), p.scores.sr50),
+//!     )?);
+//! }
+//! let summary = Summary::of(&runs)?;
+//! summary.write_json("static-box.json".as_ref())?;
+//! println!("{}", markdown(&[summary]));
+//! # Ok(())
+//! # }
+//! ```
+//! A bundle's tracker goes the same way, wrapped in a [`RuntimeTracker`].
 
+pub mod baselines;
 pub mod dataset;
+pub mod evaluate;
+pub mod metrics;
+pub mod otb;
+pub mod protocol;
+pub mod pseudo;
+mod rng;
+pub mod runtime;
+pub mod summary;
+
+pub use evaluate::{Evaluation, Options, Progress, evaluate};
+pub use runtime::RuntimeTracker;

@@ -1,4 +1,10 @@
 //! `kind:path[@split]`: how configurations and command lines name a dataset.
+//!
+//! | kind | what |
+//! |---|---|
+//! | `pairs` | registered stills, one frame each ([`PairsDataset`]) |
+//! | `pseudo` | the same stills as clips, one per target ([`pseudo::clips`], default options) |
+//! | `sequences` | LasHeR-like clips ([`SequencesDataset`]) |
 
 use std::fmt;
 use std::path::Path;
@@ -7,6 +13,7 @@ use std::str::FromStr;
 use super::pairs::PairsDataset;
 use super::sequences::{SequenceFilter, SequencesDataset};
 use super::{DatasetError, Sequence};
+use crate::pseudo::{self, PseudoError, PseudoOptions};
 
 /// Which part of a dataset.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -81,7 +88,9 @@ impl fmt::Debug for Dataset {
 #[non_exhaustive]
 pub enum OpenError {
     /// The text does not begin with a known kind.
-    #[error("dataset '{text}': expected pairs:PATH[@split] or sequences:PATH[@split]")]
+    #[error(
+        "dataset '{text}': expected pairs:PATH[@split], pseudo:PATH[@split] or sequences:PATH[@split]"
+    )]
     Kind {
         /// The text given.
         text: String,
@@ -97,9 +106,19 @@ pub enum OpenError {
     /// The folder could not be read.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
+    /// No clips could be made from the stills.
+    #[error(transparent)]
+    Pseudo(#[from] PseudoError),
+    /// None of the stills has a target of a usable size.
+    #[error("dataset '{text}': no target of a size that clips can be made from")]
+    NoClips {
+        /// The text given.
+        text: String,
+    },
 }
 
-/// Opens `pairs:PATH[@split]` or `sequences:PATH[@split]`; without a split, everything.
+/// Opens `pairs:PATH[@split]`, `pseudo:PATH[@split]` or `sequences:PATH[@split]`; without a split,
+/// everything. Of `pseudo`, all stills used are decoded at once and kept.
 ///
 /// # Errors
 /// For a text of another form, an unknown split, or a folder that cannot be read.
@@ -122,6 +141,15 @@ pub fn open(text: &str) -> Result<Dataset, OpenError> {
     let path = Path::new(path);
     let sequences: Vec<Box<dyn Sequence>> = match kind {
         "pairs" => boxed(PairsDataset::open(path, split)?.into_pairs()),
+        "pseudo" => {
+            let pairs = PairsDataset::open(path, split)?;
+            let stills = pairs.pairs().iter().map(|p| p as &dyn Sequence);
+            let clips = pseudo::clips(stills, PseudoOptions::default())?;
+            if clips.is_empty() {
+                return Err(OpenError::NoClips { text: text.to_owned() });
+            }
+            boxed(clips)
+        }
         "sequences" => {
             let filter = SequenceFilter { split, ..SequenceFilter::default() };
             boxed(SequencesDataset::open(path, &filter)?.into_sequences())

@@ -342,42 +342,8 @@ fn read_stream(
 /// # Errors
 /// When the file cannot be read, holds no line, or a line does not hold four numbers.
 pub fn read_boxes(path: &Path) -> Result<Vec<Option<BBox>>, DatasetError> {
-    // Lossy: a stray byte makes one bad number with its line, not an unreadable file.
-    let bytes =
-        std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-    let text = String::from_utf8_lossy(&bytes);
-    let text = text.strip_prefix('\u{feff}').unwrap_or(&text).trim_end();
-    let format =
-        |line, reason: String| DatasetError::Format { path: path.to_owned(), line, reason };
-    if text.is_empty() {
-        return Err(format(None, "no boxes in it: expected x,y,w,h per line".into()));
-    }
-    text.lines()
-        .enumerate()
-        .map(|(i, line)| parse_box(line).map_err(|reason| format(Some(i + 1), reason)))
-        .collect()
-}
-
-fn parse_box(line: &str) -> Result<Option<BBox>, String> {
-    let mut numbers = [0f32; 4];
-    let mut n = 0;
-    let fields = line.split([',', '\t', ' ', ';', '\r']).filter(|f| !f.is_empty());
-    for field in fields {
-        let value: f32 = field.parse().map_err(|_| format!("'{field}' is not a number"))?;
-        if value.is_infinite() {
-            return Err(format!("'{field}' is not finite"));
-        }
-        if let Some(slot) = numbers.get_mut(n) {
-            *slot = value;
-        }
-        n += 1;
-    }
-    if n != 4 {
-        return Err(format!("expected four numbers x,y,w,h, found {n} in '{}'", line.trim()));
-    }
-    let [x, y, w, h] = numbers;
-    let bbox = BBox::new(x, y, w, h);
-    Ok(bbox.is_valid().then_some(bbox))
+    let rows = crate::otb::read_rows(path)?;
+    Ok(rows.into_iter().map(|b| b.is_valid().then_some(b)).collect())
 }
 
 #[cfg(test)]
