@@ -8,7 +8,9 @@
 //! The command line is `tsda-train` (`src/main.rs`).
 
 pub mod burn_engine;
+pub mod checkpoint;
 pub mod config;
+pub mod fit;
 pub mod import;
 pub mod logging;
 pub mod losses;

@@ -1,1 +1,229 @@
-fn main() {}
+//! `tsda-train`: trains trackers. See `docs/training.md`.
+
+use anyhow::{Context, Result, bail};
+use burn::tensor::Device;
+use clap::{Parser, Subcommand, ValueEnum};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use tsda_trainer::config::Experiment;
+use tsda_trainer::fit::{self, FitOptions, Outcome};
+use tsda_trainer::import::{self, ImportKind};
+use tsda_trainer::processing::contact_sheet;
+
+/// Trains cross-modal trackers.
+#[derive(Parser)]
+#[command(version, about)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Train as a configuration says.
+    Fit(FitArgs),
+    /// Convert weights from elsewhere, checking names and shapes.
+    WeightsImport(ImportArgs),
+    /// Draw training samples as the network sees them.
+    SampleSheet(SheetArgs),
+}
+
+#[derive(clap::Args)]
+struct Source {
+    /// The experiment (TOML).
+    #[arg(long)]
+    config: PathBuf,
+    /// Folder to take instead of the configuration's only data source.
+    #[arg(long)]
+    data: Option<PathBuf>,
+}
+
+#[derive(clap::Args)]
+struct FitArgs {
+    #[command(flatten)]
+    source: Source,
+    /// Go on from the newest complete checkpoint.
+    #[arg(long)]
+    resume: bool,
+    /// Folder to write to instead of the configuration's.
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Steps of the whole run (the schedule follows) instead of the configuration's.
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Stop with a checkpoint after this step; the schedule stays that of the whole run.
+    #[arg(long)]
+    stop_after: Option<u64>,
+    /// Backbone weights, or "scratch", instead of the configuration's.
+    #[arg(long)]
+    backbone: Option<String>,
+    /// Where to compute.
+    #[arg(long, value_enum, default_value_t = DeviceName::Flex)]
+    device: DeviceName,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum DeviceName {
+    /// The CPU.
+    Flex,
+    /// A GPU through WebGPU/Vulkan (needs the cargo feature `wgpu`).
+    Wgpu,
+}
+
+#[derive(clap::Args)]
+struct ImportArgs {
+    /// What the input holds: "efficientnet-lite0" (backbone) or "full" (a whole network).
+    #[arg(long)]
+    kind: String,
+    /// File to read.
+    #[arg(long)]
+    input: PathBuf,
+    /// File to write.
+    #[arg(long)]
+    out: PathBuf,
+    /// The experiment whose [model] the weights are for; the nano preset without one.
+    #[arg(long)]
+    config: Option<PathBuf>,
+}
+
+#[derive(clap::Args)]
+struct SheetArgs {
+    #[command(flatten)]
+    source: Source,
+    /// PNG file to write.
+    #[arg(long)]
+    out: PathBuf,
+    /// Samples to draw.
+    #[arg(long, default_value_t = 16)]
+    samples: u64,
+    /// First sample of the stream.
+    #[arg(long, default_value_t = 0)]
+    first: u64,
+}
+
+fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Fit(args) => run_fit(&args),
+        Command::WeightsImport(args) => run_import(&args),
+        Command::SampleSheet(args) => run_sheet(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => {
+            eprintln!("tsda-train: {e:#}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn load(source: &Source) -> Result<Experiment> {
+    let mut experiment = Experiment::load(&source.config)?;
+    if let Some(path) = &source.data {
+        let [only] = experiment.data.as_mut_slice() else {
+            bail!(
+                "--data: {} names {} data sources; it can replace only a single one",
+                source.config.display(),
+                experiment.data.len()
+            );
+        };
+        only.path = path.clone();
+    }
+    Ok(experiment)
+}
+
+fn device(name: DeviceName) -> Result<Device> {
+    match name {
+        DeviceName::Flex => Ok(Device::flex()),
+        #[cfg(feature = "wgpu")]
+        DeviceName::Wgpu => Ok(Device::wgpu(Default::default())),
+        #[cfg(not(feature = "wgpu"))]
+        DeviceName::Wgpu => bail!("--device wgpu: this program was built without the feature wgpu"),
+    }
+}
+
+fn run_fit(args: &FitArgs) -> Result<()> {
+    let mut experiment = load(&args.source)?;
+    if let Some(out) = &args.out {
+        experiment.run.out = out.clone();
+    }
+    if let Some(steps) = args.steps {
+        experiment.run.steps = steps;
+    }
+    if let Some(backbone) = &args.backbone {
+        experiment.init.backbone = backbone.clone();
+    }
+    experiment.validate().context("command line")?;
+    let options = FitOptions {
+        resume: args.resume,
+        stop_after: args.stop_after,
+        stop: stop_on_signal()?,
+        device: device(args.device)?,
+        verbose: true,
+    };
+    match fit::fit(&experiment, &options)? {
+        Outcome::Finished { model, validation } => {
+            if let Some(v) = validation {
+                println!(
+                    "validation IoU: same sensor {:.3}, across sensors {:.3}",
+                    v.same.iou, v.cross.iou
+                );
+            }
+            println!("finished: {}", model.display());
+        }
+        Outcome::Stopped { step } => println!(
+            "stopped after step {step}; go on with: tsda-train fit --config {} --out {} --resume",
+            args.source.config.display(),
+            experiment.run.out.display()
+        ),
+    }
+    Ok(())
+}
+
+/// The first Ctrl-C or SIGTERM asks for a stop after the step under way, the second one ends the
+/// program at once.
+fn stop_on_signal() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    ctrlc::set_handler(move || {
+        if flag.swap(true, Ordering::SeqCst) {
+            std::process::exit(130);
+        }
+        eprintln!("stopping after this step (once more: at once, without a checkpoint)");
+    })
+    .context("cannot watch for Ctrl-C")?;
+    Ok(stop)
+}
+
+fn run_import(args: &ImportArgs) -> Result<()> {
+    let kind: ImportKind = args.kind.parse().map_err(|e: String| anyhow::anyhow!("--kind: {e}"))?;
+    let spec = match &args.config {
+        Some(path) => Experiment::load(path)?.model_spec()?,
+        None => tsda_runtime::ModelSpec::NANO,
+    };
+    let report = import::run(kind, &args.input, &args.out, &spec)?;
+    println!(
+        "{}: {} tensors taken, {} not needed",
+        args.out.display(),
+        report.loaded.len(),
+        report.unused.len()
+    );
+    Ok(())
+}
+
+fn run_sheet(args: &SheetArgs) -> Result<()> {
+    let experiment = load(&args.source)?;
+    let spec = experiment.model_spec()?;
+    let maker = fit::training_batches(&experiment)?;
+    let samples =
+        (0..args.samples).map(|i| maker.sample(args.first + i)).collect::<Result<Vec<_>, _>>()?;
+    let sheet = contact_sheet(&spec, &samples);
+    let mut png = std::io::Cursor::new(Vec::new());
+    sheet.write_to(&mut png, image::ImageFormat::Png).context("cannot encode the sheet")?;
+    tsda_trainer::checkpoint::write_atomic(Path::new(&args.out), png.get_ref())?;
+    for (row, sample) in samples.iter().enumerate() {
+        println!("row {row}: {}", sample.id);
+    }
+    Ok(())
+}

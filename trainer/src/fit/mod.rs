@@ -1,0 +1,484 @@
+//! The training loop.
+//!
+//! Every step's random state comes from `(seed, step)`: the samples of its batch and the device's
+//! generator, which dropout reads. Learning rates are a function of the step. So a run that was
+//! stopped and resumed ends with the same weights, bit for bit, as one that was not.
+
+mod evaluate;
+mod optim;
+mod progress;
+mod state;
+mod tensors;
+
+pub use evaluate::{Group, Validation, best_box};
+pub use optim::lr_factor;
+
+use crate::checkpoint::{CheckpointError, CheckpointStore, write_atomic};
+use crate::config::{ConfigError, Experiment, SCRATCH};
+use crate::import::{self, WeightsError};
+use crate::logging::RunLog;
+use crate::losses::{LossWeights, losses};
+use crate::model::{NetOptions, TrackerNet};
+use crate::prefetch::{PrefetchError, Prefetcher};
+use crate::processing::{Batch, BatchMaker, Processor};
+use crate::sampler::{PictureCache, SampleError, Sampler};
+use burn::module::Module;
+use burn::optim::GradientsParams;
+use burn::prelude::*;
+use progress::{Progress, Window};
+use serde::Serialize;
+use state::State;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+use tensors::Inputs;
+use tsda_runtime::SpecError;
+
+/// Keeps the validation samples apart from the training ones of the same seed.
+const VALIDATION_SEED: u64 = 0x7661_6c69_6461_7465;
+
+/// A training run that cannot start or go on.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FitError {
+    /// The configuration.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The data.
+    #[error(transparent)]
+    Sample(#[from] SampleError),
+    /// A batch could not be prepared.
+    #[error("batch of step {step}: {source}")]
+    Batch {
+        /// The step.
+        step: u64,
+        /// What went wrong.
+        source: PrefetchError<SampleError>,
+    },
+    /// The network's specification.
+    #[error("[model]: {0}")]
+    Spec(#[from] SpecError),
+    /// Weights to start from, or the final model.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// A weights file of the configuration does not exist.
+    #[error(
+        "{field}: {path} does not exist; fetch the ImageNet weights with `python3 \
+         trainer/scripts/fetch_efficientnet_lite0.py` and give their path, or train from random \
+         weights with init.backbone = \"scratch\""
+    )]
+    NoWeights {
+        /// Field of the configuration.
+        field: &'static str,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A checkpoint could not be written or read.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// A checkpoint does not belong to this run.
+    #[error("cannot resume from {path}: {reason}")]
+    Resume {
+        /// The checkpoint.
+        path: PathBuf,
+        /// What does not fit.
+        reason: String,
+    },
+    /// The output folder already holds a run.
+    #[error("{out} already holds checkpoints: go on with --resume, or choose another --out")]
+    Exists {
+        /// The folder.
+        out: PathBuf,
+    },
+    /// A file of the run could not be written.
+    #[error("cannot {action} {path}: {source}")]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The loss or the gradient is not a number.
+    #[error(
+        "step {step}: {what} is {value}; the weights were not changed and the last checkpoint is \
+         intact. Samples: {}",
+        .ids.join("; ")
+    )]
+    NotFinite {
+        /// The step.
+        step: u64,
+        /// `loss` or `gradient norm`.
+        what: &'static str,
+        /// Its value.
+        value: f32,
+        /// Samples of the batch.
+        ids: Vec<String>,
+    },
+    /// The compute device failed.
+    #[error("device: {0}")]
+    Device(String),
+}
+
+fn device_error(e: impl std::fmt::Debug) -> FitError {
+    FitError::Device(format!("{e:?}"))
+}
+
+/// How to run, apart from what is trained.
+#[derive(Clone, Debug)]
+pub struct FitOptions {
+    /// Go on from the newest complete checkpoint, if there is one.
+    pub resume: bool,
+    /// Stop (with a checkpoint) after this step, short of the end the schedule is made for.
+    pub stop_after: Option<u64>,
+    /// Set from outside to stop after the step under way, with a checkpoint.
+    pub stop: Arc<AtomicBool>,
+    /// Where to compute; autodiff is added here.
+    pub device: Device,
+    /// Print progress.
+    pub verbose: bool,
+}
+
+impl Default for FitOptions {
+    fn default() -> Self {
+        Self {
+            resume: false,
+            stop_after: None,
+            stop: Arc::default(),
+            device: Device::flex(),
+            verbose: false,
+        }
+    }
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    /// All steps are done.
+    Finished {
+        /// The final weights.
+        model: PathBuf,
+        /// The last validation, if there was one.
+        validation: Option<Validation>,
+    },
+    /// Stopped early; a checkpoint of this step was written.
+    Stopped {
+        /// Steps done.
+        step: u64,
+    },
+}
+
+#[derive(Serialize)]
+struct StepEntry {
+    loss: f64,
+    cls: f64,
+    giou: f64,
+    grad_norm: f64,
+    lr: f64,
+    samples_per_s: f64,
+    data_wait: f64,
+}
+
+#[derive(Serialize)]
+struct RunEntry {
+    parameters: usize,
+    sequences: usize,
+    batch: usize,
+    total_steps: u64,
+}
+
+#[derive(Serialize)]
+struct BadBatch<'a> {
+    what: &'a str,
+    ids: &'a [String],
+}
+
+/// A derived seed; mixes well even for neighbouring inputs (splitmix64's finaliser).
+fn mix(seed: u64, step: u64) -> u64 {
+    let mut z = seed ^ step.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+fn sampler(
+    experiment: &Experiment,
+    cache: &Arc<PictureCache>,
+    validation: bool,
+) -> Result<Sampler, SampleError> {
+    Sampler::open(&experiment.data, &experiment.sampler, cache.clone(), validation)
+}
+
+/// The batches a configuration trains on.
+///
+/// # Errors
+/// When the specification is wrong or the data cannot be read.
+pub fn training_batches(experiment: &Experiment) -> Result<BatchMaker, FitError> {
+    let spec = experiment.model_spec()?;
+    let cache = Arc::new(PictureCache::new(experiment.processing.cache_mib));
+    let processor = Processor::new(&spec, &experiment.processing, true);
+    let run = &experiment.run;
+    Ok(BatchMaker::new(sampler(experiment, &cache, false)?, processor, run.seed, run.batch))
+}
+
+/// A network with the weights training starts from.
+///
+/// # Errors
+/// When the specification is wrong or weights cannot be read.
+pub fn initial_net(experiment: &Experiment, device: &Device) -> Result<TrackerNet, FitError> {
+    let spec = experiment.model_spec()?;
+    let present = |field, path: &str| -> Result<PathBuf, FitError> {
+        let path = PathBuf::from(path);
+        if path.is_file() { Ok(path) } else { Err(FitError::NoWeights { field, path }) }
+    };
+    let (backbone, whole) = (&experiment.init.backbone, &experiment.init.weights);
+    let backbone =
+        if backbone == SCRATCH { None } else { Some(present("init.backbone", backbone)?) };
+    let whole = if whole.is_empty() { None } else { Some(present("init.weights", whole)?) };
+    device.seed(mix(experiment.run.seed, u64::MAX - 1));
+    let options = NetOptions {
+        dropout: experiment.optim.dropout,
+        attention_dropout: experiment.optim.attention_dropout,
+        freeze: experiment.optim.freeze,
+    };
+    let mut net = TrackerNet::new(&spec, &options, device)?;
+    if let Some(path) = backbone {
+        net = import::load_backbone(net, &path)?.0;
+    }
+    if let Some(path) = whole {
+        net = import::load_weights(net, &path)?.0;
+    }
+    Ok(net)
+}
+
+/// Trains as the configuration says.
+///
+/// # Errors
+/// See [`FitError`]. Nothing is written before data and weights have been opened.
+pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, FitError> {
+    let run = &experiment.run;
+    let total = experiment.total_steps();
+    let store = CheckpointStore::new(&run.out, run.keep);
+    if !options.resume && store.any()? {
+        return Err(FitError::Exists { out: run.out.clone() });
+    }
+    let maker = Arc::new(training_batches(experiment)?);
+    let validation = validation_batches(experiment)?;
+    let device = options.device.clone().autodiff();
+    let mut state = State::start(experiment, initial_net(experiment, &device)?);
+    let mut notes = Vec::new();
+    if options.resume {
+        let latest = store.latest()?;
+        notes.extend(latest.skipped.iter().map(|s| format!("passed over: {s}")));
+        if let Some(checkpoint) = latest.checkpoint {
+            notes.extend(state.load(experiment, &checkpoint)?);
+            notes.push(format!("resumed from {}", checkpoint.path.display()));
+        }
+        store.clean()?;
+    }
+
+    create_folder(&run.out)?;
+    let resolved = experiment.to_toml()?;
+    write_atomic(&run.out.join("config.resolved.toml"), resolved.as_bytes())?;
+    let log_path = run.out.join("log.jsonl");
+    let log_error = |source| FitError::Io { action: "write", path: log_path.clone(), source };
+    let mut log = RunLog::open(&run.out).map_err(log_error)?;
+    let entry = RunEntry {
+        parameters: state.net.num_params(),
+        sequences: maker.sampler().sequences(),
+        batch: run.batch,
+        total_steps: total,
+    };
+    let event = if state.step > 0 { "resume" } else { "start" };
+    log.entry(event, state.step, &entry, &[]).map_err(log_error)?;
+    let progress = Progress::new(options.verbose, state.step, total);
+    notes.iter().for_each(|note| progress.line(note));
+
+    let end = options.stop_after.map_or(total, |s| s.min(total));
+    let weights =
+        LossWeights { classification: experiment.loss.cls, giou: experiment.loss.reg };
+    let backbone = optim::backbone_group().map_err(FitError::Device)?;
+    let source = maker.clone();
+    let mut batches =
+        Prefetcher::new(state.step..end, run.workers, run.workers + 1, move |step| {
+            source.step(step)
+        })
+        .map_err(|source| FitError::Batch { step: state.step, source })?;
+    let mut window = Window::new(run.batch);
+    let mut last = None;
+    let mut saved = state.step;
+    while state.step < end && !options.stop.load(Ordering::Relaxed) {
+        let waited = Instant::now();
+        let Some(batch) = batches.next() else { break };
+        let batch = batch.map_err(|source| FitError::Batch { step: state.step, source })?;
+        window.wait(waited.elapsed());
+        let step = state.step;
+        device.seed(mix(run.seed, step));
+        let factor = lr_factor(&experiment.optim, step, total);
+        let rate = optim::learning_rate(&experiment.optim, &backbone, factor);
+        let figures = match train_step(&mut state, &batch, experiment, weights, rate, &device) {
+            Ok(figures) => figures,
+            Err(e) => {
+                if let FitError::NotFinite { what, ids, .. } = &e {
+                    log.entry("not_finite", step, &BadBatch { what, ids }, &[]).map_err(log_error)?;
+                }
+                return Err(e);
+            }
+        };
+        window.add(figures);
+        state.step += 1;
+        progress.step(state.step, &window);
+        let finished = state.step == total;
+        if state.step.is_multiple_of(run.log_every) || state.step == end {
+            let e = window.take(experiment.optim.lr_head * factor);
+            progress.entry(state.step, &e);
+            let scalars = [
+                ("loss", e.loss),
+                ("cls", e.cls),
+                ("giou", e.giou),
+                ("grad_norm", e.grad_norm),
+                ("lr", e.lr),
+                ("samples_per_s", e.samples_per_s),
+                ("data_wait", e.data_wait),
+            ];
+            log.entry("train", state.step, &e, &scalars).map_err(log_error)?;
+        }
+        let due = run.validate_every > 0 && (state.step.is_multiple_of(run.validate_every) || finished);
+        if let (true, Some(maker)) = (due, &validation) {
+            let net = state.inference_net();
+            let plain = options.device.clone();
+            let v = evaluate::validate(
+                &net,
+                maker,
+                run.validation_samples,
+                run.batch,
+                weights,
+                &plain,
+            )?;
+            progress.validation(state.step, &v);
+            let scalars: Vec<(&str, f64)> = [("same", v.same), ("cross", v.cross), ("all", v.all)]
+                .iter()
+                .flat_map(|(group, g)| scalar_names(group).into_iter().zip([g.cls, g.giou, g.iou, g.success]))
+                .collect();
+            log.entry("validation", state.step, &v, &scalars).map_err(log_error)?;
+            last = Some(v);
+            window.restart();
+        }
+        if state.step.is_multiple_of(run.checkpoint_every) || finished {
+            state.save(&store, &resolved)?;
+            saved = state.step;
+            window.restart();
+        }
+    }
+    if saved != state.step {
+        state.save(&store, &resolved)?;
+    }
+    progress.finish();
+    if state.step < total {
+        return Ok(Outcome::Stopped { step: state.step });
+    }
+    let model = run.out.join("model.safetensors");
+    import::save_weights(&state.inference_net(), &model)?;
+    Ok(Outcome::Finished { model, validation: last })
+}
+
+fn scalar_names(group: &str) -> [&'static str; 4] {
+    match group {
+        "same" => ["same/cls", "same/giou", "same/iou", "same/success"],
+        "cross" => ["cross/cls", "cross/giou", "cross/iou", "cross/success"],
+        _ => ["all/cls", "all/giou", "all/iou", "all/success"],
+    }
+}
+
+fn validation_batches(experiment: &Experiment) -> Result<Option<BatchMaker>, FitError> {
+    let run = &experiment.run;
+    if run.validate_every == 0 {
+        return Ok(None);
+    }
+    let cache = Arc::new(PictureCache::new(experiment.processing.cache_mib));
+    let sampler = sampler(experiment, &cache, true)?;
+    if sampler.is_empty() {
+        return Ok(None);
+    }
+    let processor = Processor::new(&experiment.model_spec()?, &experiment.processing, false);
+    Ok(Some(BatchMaker::new(sampler, processor, run.seed ^ VALIDATION_SEED, run.batch)))
+}
+
+fn create_folder(path: &Path) -> Result<(), FitError> {
+    std::fs::create_dir_all(path).map_err(|source| FitError::Io {
+        action: "create",
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Figures of one step.
+#[derive(Clone, Copy, Debug, Default)]
+struct StepFigures {
+    loss: f64,
+    cls: f64,
+    giou: f64,
+    grad_norm: f64,
+}
+
+fn train_step(
+    state: &mut State,
+    batch: &Batch,
+    experiment: &Experiment,
+    weights: LossWeights,
+    rate: burn::lr_scheduler::module_lr_scheduler::ModuleLearningRate,
+    device: &Device,
+) -> Result<StepFigures, FitError> {
+    let step = state.step;
+    let finite = |what: &'static str, value: f32| {
+        if value.is_finite() {
+            return Ok(f64::from(value));
+        }
+        Err(FitError::NotFinite { step, what, value, ids: batch.ids.clone() })
+    };
+    let inputs = Inputs::new(batch, state.net.spec(), device);
+    let output = state.net.forward_train(
+        inputs.template_crops,
+        inputs.search_crops,
+        inputs.template_labels,
+        inputs.template_ltrb,
+    );
+    let l = losses(
+        weights,
+        output.scores,
+        inputs.search_labels,
+        output.ltrb,
+        inputs.search_ltrb,
+        &batch.region,
+    );
+    let loss = finite("loss", l.total.clone().into_scalar::<f32>())?;
+    let cls = f64::from(l.classification.into_scalar::<f32>());
+    let giou = f64::from(l.giou.into_scalar::<f32>());
+    let gradients = GradientsParams::from_grads(l.total.backward(), &state.net);
+    let norm = optim::gradient_norm(&state.net, &gradients);
+    let grad_norm = finite("gradient norm", norm)?;
+    let gradients = optim::clip(&state.net, gradients, norm, experiment.optim.clip_norm);
+    state.update(rate, gradients, experiment.optim.ema_decay);
+    Ok(StepFigures { loss, cls, giou, grad_norm })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_of_neighbouring_steps_are_unrelated() {
+        let seeds: Vec<u64> = (0..1000).map(|s| mix(1, s)).collect();
+        let mut unique = seeds.clone();
+        unique.sort_unstable();
+        unique.dedup();
+        assert_eq!(unique.len(), seeds.len());
+        for pair in seeds.windows(2) {
+            let differing = (pair[0] ^ pair[1]).count_ones();
+            assert!((8..=56).contains(&differing), "{differing} bits differ");
+        }
+        assert_ne!(mix(1, 2), mix(2, 1));
+    }
+}
