@@ -9,6 +9,12 @@
 //!    [`Engine::write_template`]: the head feature of the last `features` call becomes the tokens of
 //!    that slot.
 
+#[cfg(feature = "tract")]
+pub mod tract;
+
+#[cfg(feature = "tract")]
+pub use tract::TractEngine;
+
 use crate::spec::ModelSpec;
 
 /// The three graphs behind one network, with their buffers.
