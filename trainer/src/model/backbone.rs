@@ -102,4 +102,13 @@ impl BackboneNet {
             Self::ResNet(net) => net.forward(x, frozen),
         }
     }
+
+    /// [`Self::forward`] for training on the CPU, as a batch-wide map `(C, B, S/16, S/16)`; see
+    /// [`super::kernels`].
+    pub fn forward_wide(&self, x: Tensor<4>, frozen: usize) -> Tensor<4> {
+        match self {
+            Self::EfficientNet(net) if frozen > 0 => net.forward_wide(x, frozen),
+            _ => self.forward(x, frozen).permute([1, 0, 2, 3]),
+        }
+    }
 }

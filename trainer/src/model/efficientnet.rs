@@ -3,7 +3,10 @@
 //! No squeeze-excite, ReLU6, batch-norm eps 1e-3, TensorFlow "SAME" padding. Crops are multiples of
 //! 16, so every stride-2 layer sees an even side and its padding is a constant.
 
-use super::layers::{Activation, Conv, FrozenBatchNorm, Geometry, conv_bn};
+use super::layers::{
+    Activation, Conv, FrozenBatchNorm, Geometry, conv_bn, depthwise_bn_relu6_wide,
+    pointwise_bn_wide,
+};
 use burn::prelude::*;
 
 const EPSILON: f64 = 1e-3;
@@ -70,6 +73,27 @@ impl MbConv {
         let y = conv_bn(&self.project_conv, &self.bn2, Activation::Identity, on_graph, y);
         if self.residual { y + x } else { y }
     }
+
+    /// [`Self::forward`] of a batch-wide map `(C, N, H, W)`, on the graph.
+    fn forward_wide(&self, x: Tensor<4>) -> Tensor<4> {
+        let [inp, n, h, w] = x.dims();
+        let y = match (&self.expand_conv, &self.bn0) {
+            (Some(conv), Some(bn)) => {
+                let flat = x.clone().reshape([inp, n * h * w]);
+                let y = pointwise_bn_wide(conv, bn, Activation::Relu6, flat);
+                let mid = y.dims()[0];
+                y.reshape([mid, n, h, w])
+            }
+            _ => x.clone(),
+        };
+        let y = depthwise_bn_relu6_wide(&self.depthwise_conv, &self.bn1, y);
+        let [mid, _, h, w] = y.dims();
+        let flat = y.reshape([mid, n * h * w]);
+        let y = pointwise_bn_wide(&self.project_conv, &self.bn2, Activation::Identity, flat);
+        let out = y.dims()[0];
+        let y = y.reshape([out, n, h, w]);
+        if self.residual { y + x } else { y }
+    }
 }
 
 /// Stem and blocks 0..=10.
@@ -105,5 +129,17 @@ impl EfficientNetLite0 {
             x = block.forward(x, frozen < i + 2);
         }
         x
+    }
+
+    /// [`Self::forward`] for training on the CPU, as a batch-wide map `(112, B, S/16, S/16)`. At
+    /// least the stem has to be frozen.
+    pub fn forward_wide(&self, x: Tensor<4>, frozen: usize) -> Tensor<4> {
+        let leading = frozen.saturating_sub(1).min(self.blocks.len());
+        let mut x = conv_bn(&self.conv_stem, &self.bn0, Activation::Relu6, false, x.inner());
+        for block in &self.blocks[..leading] {
+            x = block.forward(x, false);
+        }
+        let x = x.permute([1, 0, 2, 3]);
+        self.blocks[leading..].iter().fold(x, |x, block| block.forward_wide(x))
     }
 }

@@ -1,7 +1,8 @@
 //! Everything after the backbone: head feature, encodings, filter prediction, classifier and box
 //! regressor (spec 1.3 to 1.8).
 
-use super::layers::{Conv, Geometry, instance_l2_norm, positional_code};
+use super::kernels;
+use super::layers::{Conv, Geometry, instance_l2_norm, instance_l2_norm_wide, positional_code};
 use super::transformer::{Shape, Transformer, linear_layer};
 use burn::module::Param;
 use burn::nn::{BatchNorm, BatchNormConfig, GroupNorm, GroupNormConfig, Linear};
@@ -81,8 +82,47 @@ pub(crate) struct Head {
     filter_size: usize,
 }
 
+impl BoxRegressor {
+    /// Tower and last layer on a batch-wide map `(d, N, H, W)`, as `(N, 4, H, W)`.
+    fn distances_wide(&self, x: Tensor<4>) -> Tensor<4> {
+        let [d, n, h, w] = x.dims();
+        let x = self.tower.iter().fold(x, |x, layer| {
+            let y = layer.conv.forward_wide(x).reshape([d, n, h * w]);
+            relu(layer.norm_wide(y)).reshape([d, n, h, w])
+        });
+        self.bbreg_layer.forward_wide(x).exp().reshape([4, n, h, w]).swap_dims(0, 1)
+    }
+}
+
+impl TowerLayer {
+    /// The one-group norm of a batch-wide map `(d, N, H * W)`.
+    fn norm_wide(&self, x: Tensor<3>) -> Tensor<3> {
+        let d = x.dims()[0];
+        let x = x.clone() - x.mean_dim(2).mean_dim(0);
+        let variance = x.clone().powi_scalar(2).mean_dim(2).mean_dim(0);
+        let x = x * variance.add_scalar(self.norm.epsilon).sqrt().recip();
+        match (&self.norm.gamma, &self.norm.beta) {
+            (Some(gamma), Some(beta)) => {
+                x * gamma.val().reshape([d, 1, 1]) + beta.val().reshape([d, 1, 1])
+            }
+            _ => x,
+        }
+    }
+}
+
 /// Layers of the box tower.
 const TOWER: usize = 4;
+
+/// A fresh classifier whose scores are near 0: filter and encoder output are both layer-normed, so
+/// the default initialisation would start with scores of some +-7 and a hundredfold loss.
+fn quiet_linear(d: usize, device: &Device) -> Linear {
+    let bound = 0.05 / (d as f64).sqrt();
+    let mut linear = linear_layer(d, d, device);
+    linear.weight =
+        Param::from_tensor(Tensor::random([d, d], Distribution::Uniform(-bound, bound), device));
+    linear.bias = Some(Param::from_tensor(Tensor::zeros([d], device)));
+    linear
+}
 
 impl Head {
     /// A fresh head (initialisation of spec 1.9).
@@ -96,6 +136,9 @@ impl Head {
             attention_dropout,
         };
         let conv = |i, o, bias| Conv::new(i, o, Geometry::centred(3, 1), bias, device);
+        // exp(bias) of a fresh regressor is the mean ltrb of a centred target, so that training
+        // starts from boxes of the right size.
+        let half_target = (0.5 / spec.search_factor).ln();
         let embedding =
             || Param::from_tensor(Tensor::random([1, d], Distribution::Normal(0.0, 1.0), device));
         Self {
@@ -111,7 +154,7 @@ impl Head {
                 query_embed_fg: embedding(),
                 query_embed_test: spec.test_embedding.then(embedding),
             },
-            classifier: Classifier { linear: linear_layer(d, d, device) },
+            classifier: Classifier { linear: quiet_linear(d, device) },
             bb_regressor: BoxRegressor {
                 linear: linear_layer(d, d, device),
                 tower: (0..TOWER)
@@ -120,15 +163,33 @@ impl Head {
                         norm: GroupNormConfig::new(1, d).init(device),
                     })
                     .collect(),
-                bbreg_layer: conv(d, 4, true),
+                bbreg_layer: Conv {
+                    bias: Some(Param::from_tensor(Tensor::full([4], half_target, device))),
+                    ..conv(d, 4, true)
+                },
             },
             filter_size: spec.filter_size.into(),
         }
     }
 
+    /// Where the parameters are, and whether they train.
+    pub fn device(&self) -> Device {
+        self.feature_extractor.weight.val().device()
+    }
+
     /// Backbone feature `(B, C, F, F)` to head feature `(B, d, F, F)` (spec 1.3).
     pub fn feature(&self, x: Tensor<4>) -> Tensor<4> {
         instance_l2_norm(self.feature_extractor.forward(x), self.filter_size)
+    }
+
+    /// [`Self::feature`] of a batch-wide map `(C, N, F, F)`, as `(N, d, F, F)`.
+    pub fn feature_wide(&self, x: Tensor<4>) -> Tensor<4> {
+        let [_, n, h, w] = x.dims();
+        let y = self.feature_extractor.forward_wide(x);
+        let d = y.dims()[0];
+        instance_l2_norm_wide(y.reshape([d, n, h * w]), self.filter_size)
+            .swap_dims(0, 1)
+            .reshape([n, d, h, w])
     }
 
     /// Tokens of template frames, `(N, F*F, d)`, from features `(N, d, F, F)`, labels `(N, F, F)`
@@ -187,7 +248,11 @@ impl Head {
         let regressor = &self.bb_regressor;
         let weights = regressor.linear.forward(filter).reshape([b, d, 1]);
         let attention = encoded.clone().matmul(weights);
-        let x = (encoded * attention).swap_dims(1, 2).reshape([b, d, side, side]);
+        let x = encoded * attention;
+        if x.is_autodiff() && kernels::supports(&x.device()) {
+            return regressor.distances_wide(x.permute([2, 0, 1]).reshape([d, b, side, side]));
+        }
+        let x = x.swap_dims(1, 2).reshape([b, d, side, side]);
         let x = regressor
             .tower
             .iter()

@@ -3,6 +3,7 @@
 //! All of them run unchanged on a plain, an autodiff and a capture device. Convolution weights are
 //! kept in PyTorch's layout `(out, in / groups, k, k)`.
 
+use super::kernels::{self, Window};
 use burn::module::Param;
 use burn::prelude::*;
 use burn::tensor::Distribution;
@@ -37,6 +38,10 @@ impl Geometry {
         Self { kernel, stride, pad: (total / 2, total - total / 2), groups }
     }
 
+    fn window(&self) -> Window {
+        Window { kernel: self.kernel, stride: self.stride, before: self.pad.0 }
+    }
+
     fn options(&self) -> ConvOptions<2> {
         ConvOptions::new_with_padding([self.stride; 2], [self.pad; 2], [1; 2], self.groups)
     }
@@ -68,7 +73,7 @@ pub(crate) struct Conv {
     /// `(out)`.
     pub bias: Option<Param<Tensor<1>>>,
     #[module(skip)]
-    geometry: Geometry,
+    pub geometry: Geometry,
 }
 
 impl Conv {
@@ -80,6 +85,18 @@ impl Conv {
             weight: uniform([out, inp / groups, kernel, kernel], bound, device),
             bias: bias.then(|| uniform([out], bound, device)),
             geometry,
+        }
+    }
+
+    /// Stride-1 convolution of a batch-wide map `(in, N, H, W)` as one matrix product,
+    /// `(out, N * H * W)`; see [`kernels`].
+    pub fn forward_wide(&self, x: Tensor<4>) -> Tensor<2> {
+        let [out, inp, k, _] = self.weight.dims();
+        let weight = self.weight.val().reshape([out, inp * k * k]);
+        let y = weight.matmul(kernels::unfold_same(x, self.geometry.window()));
+        match &self.bias {
+            Some(bias) => y + bias.val().reshape([out, 1]),
+            None => y,
         }
     }
 
@@ -155,6 +172,33 @@ pub(crate) fn conv_bn(
     activation.apply(conv2d(x, weight, Some(bias), conv.geometry.options()))
 }
 
+/// [`conv_bn`] for a 1x1 convolution of a batch-wide map: `(in, M)` to `(out, M)`.
+pub(crate) fn pointwise_bn_wide(
+    conv: &Conv,
+    bn: &FrozenBatchNorm,
+    activation: Activation,
+    x: Tensor<2>,
+) -> Tensor<2> {
+    let (weight, bias) = fold(conv, bn, true);
+    let [out, inp, _, _] = weight.dims();
+    let y = weight.reshape([out, inp]).matmul(x);
+    match activation {
+        Activation::Relu6 => kernels::bias_relu6(y, bias),
+        other => other.apply(y + bias.reshape([out, 1])),
+    }
+}
+
+/// [`conv_bn`] for a depthwise convolution of a batch-wide map `(C, N, H, W)` with ReLU6.
+pub(crate) fn depthwise_bn_relu6_wide(
+    conv: &Conv,
+    bn: &FrozenBatchNorm,
+    x: Tensor<4>,
+) -> Tensor<4> {
+    let (weight, bias) = fold(conv, bn, true);
+    let [channels, _, k, _] = weight.dims();
+    kernels::depthwise_relu6(x, weight.reshape([channels, k * k]), bias, conv.geometry.window())
+}
+
 /// Weight and bias of the convolution that equals `bn` after `conv`.
 fn fold(conv: &Conv, bn: &FrozenBatchNorm, on_graph: bool) -> (Tensor<4>, Tensor<1>) {
     let (weight, gamma, beta) = (conv.weight.val(), bn.weight.val(), bn.bias.val());
@@ -181,6 +225,15 @@ pub(crate) fn instance_l2_norm(x: Tensor<4>, filter_size: usize) -> Tensor<4> {
     // s * sqrt(n / e), written with one square root and one division.
     let factor = energy.sqrt().recip().mul_scalar(scale * (count as f64).sqrt());
     (flat * factor).reshape([b, c, h, w])
+}
+
+/// [`instance_l2_norm`] of a batch-wide map `(C, N, H * W)`.
+pub(crate) fn instance_l2_norm_wide(x: Tensor<3>, filter_size: usize) -> Tensor<3> {
+    let [c, _, cells] = x.dims();
+    let count = c * cells;
+    let scale = (1.0 / (c * filter_size * filter_size) as f64).sqrt();
+    let energy = x.clone().powi_scalar(2).sum_dim(2).sum_dim(0).add_scalar(1e-5);
+    x * energy.sqrt().recip().mul_scalar(scale * (count as f64).sqrt())
 }
 
 /// The fixed positional code of one frame, `(side * side, width)` row-major (spec 1.5, with the

@@ -27,6 +27,7 @@
 mod backbone;
 mod efficientnet;
 mod head;
+mod kernels;
 mod layers;
 mod names;
 mod resnet;
@@ -174,7 +175,8 @@ impl TrackerNet {
         let bt = template_crops.dims()[0];
         let b = search_crops.dims()[0];
         let t = bt / b;
-        let features = self.features(Tensor::cat(vec![template_crops, search_crops], 0));
+        let crops = Tensor::cat(vec![template_crops, search_crops], 0);
+        let features = self.training_features(crops);
         let [_, d, f, _] = features.dims();
         let template_features = features.clone().narrow(0, 0, bt);
         let search_features = features.narrow(0, bt, b);
@@ -190,6 +192,16 @@ impl TrackerNet {
             ltrb: self.head.ltrb(filter, encoded, f),
             template_features: template_features.reshape([b, t, d, f, f]),
             search_features,
+        }
+    }
+
+    /// [`Self::features`] by the fastest road of the device.
+    fn training_features(&self, crops: Tensor<4>) -> Tensor<4> {
+        let device = self.head.device();
+        if device.is_autodiff() && kernels::supports(&device) {
+            self.head.feature_wide(self.feature_extractor.forward_wide(crops, self.frozen))
+        } else {
+            self.features(crops)
         }
     }
 }
