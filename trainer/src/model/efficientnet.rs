@@ -3,11 +3,9 @@
 //! No squeeze-excite, ReLU6, batch-norm eps 1e-3, TensorFlow "SAME" padding. Crops are multiples of
 //! 16, so every stride-2 layer sees an even side and its padding is a constant.
 
-use super::layers::{
-    Activation, Conv, FrozenBatchNorm, Geometry, conv_bn, depthwise_bn_relu6_wide,
-    pointwise_bn_wide,
-};
+use super::layers::{Activation, Conv, FrozenBatchNorm, Geometry, WideConv, conv_bn};
 use burn::prelude::*;
+use rayon::prelude::*;
 
 const EPSILON: f64 = 1e-3;
 
@@ -74,24 +72,33 @@ impl MbConv {
         if self.residual { y + x } else { y }
     }
 
-    /// [`Self::forward`] of a batch-wide map `(C, N, H, W)`, on the graph.
-    fn forward_wide(&self, x: Tensor<4>) -> Tensor<4> {
-        let [inp, n, h, w] = x.dims();
-        let y = match (&self.expand_conv, &self.bn0) {
-            (Some(conv), Some(bn)) => {
-                let flat = x.clone().reshape([inp, n * h * w]);
-                let y = pointwise_bn_wide(conv, bn, Activation::Relu6, flat);
-                let mid = y.dims()[0];
-                y.reshape([mid, n, h, w])
-            }
-            _ => x.clone(),
+    /// Ready for batch-wide maps.
+    fn wide(&self, on_graph: bool) -> WideMbConv {
+        let fold = |conv, bn| WideConv::new(conv, bn, on_graph);
+        WideMbConv {
+            expand: self.expand_conv.as_ref().zip(self.bn0.as_ref()).map(|(c, b)| fold(c, b)),
+            depthwise: fold(&self.depthwise_conv, &self.bn1),
+            project: fold(&self.project_conv, &self.bn2),
+            residual: self.residual,
+        }
+    }
+}
+
+/// [`MbConv`] on batch-wide maps `(C, N, H, W)`.
+struct WideMbConv {
+    expand: Option<WideConv>,
+    depthwise: WideConv,
+    project: WideConv,
+    residual: bool,
+}
+
+impl WideMbConv {
+    fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        let y = match &self.expand {
+            Some(expand) => expand.pointwise_relu6(x.clone()),
+            None => x.clone(),
         };
-        let y = depthwise_bn_relu6_wide(&self.depthwise_conv, &self.bn1, y);
-        let [mid, _, h, w] = y.dims();
-        let flat = y.reshape([mid, n * h * w]);
-        let y = pointwise_bn_wide(&self.project_conv, &self.bn2, Activation::Identity, flat);
-        let out = y.dims()[0];
-        let y = y.reshape([out, n, h, w]);
+        let y = self.project.pointwise(self.depthwise.depthwise_relu6(y));
         if self.residual { y + x } else { y }
     }
 }
@@ -135,11 +142,20 @@ impl EfficientNetLite0 {
     /// least the stem has to be frozen.
     pub fn forward_wide(&self, x: Tensor<4>, frozen: usize) -> Tensor<4> {
         let leading = frozen.saturating_sub(1).min(self.blocks.len());
-        let mut x = conv_bn(&self.conv_stem, &self.bn0, Activation::Relu6, false, x.inner());
-        for block in &self.blocks[..leading] {
-            x = block.forward(x, false);
-        }
-        let x = x.permute([1, 0, 2, 3]);
-        self.blocks[leading..].iter().fold(x, |x, block| block.forward_wide(x))
+        let wide = |blocks: &[MbConv], on_graph| -> Vec<WideMbConv> {
+            blocks.iter().map(|block| block.wide(on_graph)).collect()
+        };
+        let frozen = wide(&self.blocks[..leading], false);
+        let trained = wide(&self.blocks[leading..], true);
+        // Image by image: the large early maps stay in the cache, and every core has its own.
+        let images: Vec<Tensor<4>> = x.inner().split(1, 0);
+        let maps: Vec<Tensor<4>> = images
+            .into_par_iter()
+            .map(|image| {
+                let x = conv_bn(&self.conv_stem, &self.bn0, Activation::Relu6, false, image);
+                frozen.iter().fold(x.swap_dims(0, 1), |x, block| block.forward(x))
+            })
+            .collect();
+        trained.iter().fold(Tensor::cat(maps, 1), |x, block| block.forward(x))
     }
 }

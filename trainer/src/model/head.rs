@@ -4,11 +4,12 @@
 use super::kernels;
 use super::layers::{Conv, Geometry, instance_l2_norm, instance_l2_norm_wide, positional_code};
 use super::transformer::{Shape, Transformer, linear_layer};
-use burn::module::Param;
+use burn::module::{Param, RunningState};
 use burn::nn::{BatchNorm, BatchNormConfig, GroupNorm, GroupNormConfig, Linear};
 use burn::prelude::*;
 use burn::tensor::Distribution;
 use burn::tensor::activation::relu;
+use burn::tensor::module::batch_norm_train;
 use tsda_runtime::ModelSpec;
 
 /// MLP on `ltrb` (spec 1.4). Its batch norms are real ones: batch statistics in training.
@@ -34,10 +35,32 @@ impl BoxEncoding {
 
     /// `(N, 4)` to `(N, d)`.
     fn forward(&self, ltrb: Tensor<2>) -> Tensor<2> {
-        let x = relu(self.bn1.forward(self.conv0.forward(ltrb)));
-        let x = relu(self.bn4.forward(self.conv3.forward(x)));
+        let x = relu(batch_norm(&self.bn1, self.conv0.forward(ltrb)));
+        let x = relu(batch_norm(&self.bn4, self.conv3.forward(x)));
         self.conv6.forward(x)
     }
+}
+
+/// Batch norm of `(N, C)`. As [`BatchNorm::forward`], but the running variance takes the unbiased
+/// estimate, as in PyTorch (spec 2.6).
+fn batch_norm(bn: &BatchNorm, x: Tensor<2>) -> Tensor<2> {
+    let count = x.dims()[0];
+    if count < 2 || !x.is_autodiff() || !bn.training.is_enabled() {
+        return bn.forward(x);
+    }
+    let batch = batch_norm_train(x, bn.gamma.val(), bn.beta.val(), bn.epsilon);
+    let blend = |running: &RunningState<Tensor<1>>, new: Tensor<1>| {
+        let new = new.inner().mul_scalar(bn.momentum);
+        let blended = running.value_sync().inner().mul_scalar(1.0 - bn.momentum) + new;
+        running.update(Tensor::from_inner(blended));
+        // Updates wait in a per-thread slot that checkpoints do not see; a resumed run would lack
+        // the last one.
+        running.value_sync();
+    };
+    let unbiased = count as f64 / (count - 1) as f64;
+    blend(&bn.running_mean, batch.mean);
+    blend(&bn.running_var, batch.variance.mul_scalar(unbiased));
+    batch.output
 }
 
 /// Encodings and transformer.

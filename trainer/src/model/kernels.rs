@@ -217,34 +217,30 @@ fn tensor(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape.to_vec()))
 }
 
-/// Copies a plane into the middle of a zeroed one of width `wide`.
-fn pad(plane: &[f32], width: usize, padded: &mut [f32], wide: usize, before: usize) {
-    padded.fill(0.0);
-    for (y, row) in plane.chunks_exact(width).enumerate() {
-        let at = (y + before) * wide + before;
-        padded[at..at + width].copy_from_slice(row);
-    }
-}
-
-/// Sizes of one padded plane. The padded plane has `wide` columns; an output row starts every
-/// `wide` (stride 1) or `stride * wide` values, so that a tap is one contiguous run over all rows.
+/// Where the values of one plane lie for a windowed operation.
+///
+/// The padded plane is split into `stride * stride` phases (even and odd rows and columns at
+/// stride 2), so that what one tap of the kernel reads for all outputs is a single contiguous run.
+/// Runs are `wide` long per output row; what they hold behind the output's width is ignored.
 struct Plan {
     side: [usize; 2],
     out: [usize; 2],
+    /// Columns of a phase.
     wide: usize,
-    padded: usize,
+    /// Values of a phase.
+    phase: usize,
     window: Window,
 }
 
 impl Plan {
     fn new([h, w]: [usize; 2], window: Window) -> Self {
-        let Window { kernel, stride, .. } = window;
+        let Window { kernel, stride, before } = window;
         let out = [h.div_ceil(stride), w.div_ceil(stride)];
-        let wide = (out[1] - 1) * stride + kernel;
-        let wide = wide.max(w + window.before);
-        let high = ((out[0] - 1) * stride + kernel).max(h + window.before);
-        // A little more than the plane, since runs over all rows end past its last column.
-        Self { side: [h, w], out, wide, padded: high * wide + kernel, window }
+        let phase_side = |out: usize, side: usize| {
+            (out + (kernel - 1) / stride).max((side + before).div_ceil(stride))
+        };
+        let wide = phase_side(out[1], w);
+        Self { side: [h, w], out, wide, phase: phase_side(out[0], h) * wide, window }
     }
 
     fn plane(&self) -> usize {
@@ -255,14 +251,56 @@ impl Plan {
         self.out[0] * self.out[1]
     }
 
-    /// Length of a run over all output rows in the padded plane at stride 1.
+    /// A buffer for all phases of a plane.
+    fn phases(&self) -> Vec<f32> {
+        vec![0.0; self.window.stride * self.window.stride * self.phase]
+    }
+
+    /// Length of a run over all output rows.
     fn run(&self) -> usize {
         (self.out[0] - 1) * self.wide + self.out[1]
     }
 
+    /// Taps of the kernel, row-major, and where their runs begin.
     fn taps(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
-        let k = self.window.kernel;
-        (0..k * k).map(move |t| (t, (t / k) * self.wide + t % k))
+        let Window { kernel, stride, .. } = self.window;
+        (0..kernel * kernel).map(move |tap| (tap, self.index(tap / kernel, tap % kernel, stride)))
+    }
+
+    /// Index of a row and column of the padded plane among the phases.
+    fn index(&self, row: usize, column: usize, stride: usize) -> usize {
+        let phase = (row % stride) * stride + column % stride;
+        phase * self.phase + (row / stride) * self.wide + column / stride
+    }
+
+    /// Writes a plane into its place; the padding around it has to be zero already.
+    fn split(&self, plane: &[f32], phases: &mut [f32]) {
+        let Window { stride, before, .. } = self.window;
+        for (y, row) in plane.chunks_exact(self.side[1]).enumerate() {
+            if stride == 1 {
+                let at = self.index(y + before, before, 1);
+                phases[at..at + row.len()].copy_from_slice(row);
+            } else {
+                for (x, v) in row.iter().enumerate() {
+                    phases[self.index(y + before, x + before, stride)] = *v;
+                }
+            }
+        }
+    }
+
+    /// Reads a plane from its place.
+    fn join(&self, phases: &[f32], plane: &mut [f32]) {
+        let Window { stride, before, .. } = self.window;
+        for (y, row) in plane.chunks_exact_mut(self.side[1]).enumerate() {
+            if stride == 1 {
+                let at = self.index(y + before, before, 1);
+                row.copy_from_slice(&phases[at..at + row.len()]);
+            } else {
+                for (x, v) in row.iter_mut().enumerate() {
+                    *v = phases[self.index(y + before, x + before, stride)];
+                }
+            }
+        }
     }
 }
 
@@ -280,35 +318,24 @@ impl TrainOps for Flex {
         let taps = window.kernel * window.kernel;
         let mut y = vec![0.0f32; c * n * plan.out_plane()];
         y.par_chunks_mut(n * plan.out_plane()).enumerate().for_each(|(ch, y)| {
-            let mut padded = vec![0.0; plan.padded];
+            let mut phases = plan.phases();
             let mut sums = vec![0.0; plan.run()];
             let weight = &ws[ch * taps..(ch + 1) * taps];
             let images = &xs[ch * n * plan.plane()..(ch + 1) * n * plan.plane()];
             for (image, y) in
                 images.chunks_exact(plan.plane()).zip(y.chunks_exact_mut(plan.out_plane()))
             {
-                pad(image, w, &mut padded, plan.wide, window.before);
-                if window.stride == 1 {
-                    sums.fill(bs[ch]);
-                    for (t, offset) in plan.taps() {
-                        let run = &padded[offset..offset + sums.len()];
-                        let weight = weight[t];
-                        for (s, v) in sums.iter_mut().zip(run) {
-                            *s += weight * v;
-                        }
+                plan.split(image, &mut phases);
+                sums.fill(bs[ch]);
+                for (tap, from) in plan.taps() {
+                    let weight = weight[tap];
+                    for (s, v) in sums.iter_mut().zip(&phases[from..]) {
+                        *s += weight * v;
                     }
-                    for (y, row) in y.chunks_exact_mut(plan.out[1]).zip(sums.chunks(plan.wide)) {
-                        for (y, s) in y.iter_mut().zip(row) {
-                            *y = s.clamp(0.0, 6.0);
-                        }
-                    }
-                } else {
-                    for (i, y) in y.iter_mut().enumerate() {
-                        let (row, column) = (i / plan.out[1], i % plan.out[1]);
-                        let at = (row * plan.wide + column) * window.stride;
-                        let sum: f32 =
-                            plan.taps().map(|(t, offset)| weight[t] * padded[at + offset]).sum();
-                        *y = (sum + bs[ch]).clamp(0.0, 6.0);
+                }
+                for (y, row) in y.chunks_exact_mut(plan.out[1]).zip(sums.chunks(plan.wide)) {
+                    for (y, s) in y.iter_mut().zip(row) {
+                        *y = s.clamp(0.0, 6.0);
                     }
                 }
             }
@@ -392,45 +419,37 @@ impl TrainGradients for Flex {
             .zip(gb.par_iter_mut())
             .enumerate()
             .for_each(|(ch, ((gx, gw), gb))| {
-                let mut padded = vec![0.0; plan.padded];
-                let mut spread = vec![0.0; plan.padded];
-                // The output gradient on the padded plane's grid, zeros between.
-                let mut g = vec![
-                    0.0;
-                    (plan.out[0] - 1) * window.stride * plan.wide
-                        + (plan.out[1] - 1) * window.stride
-                        + 1
-                ];
+                let mut phases = plan.phases();
+                let mut spread = plan.phases();
+                // The output gradient on the runs' grid, zeros behind every row.
+                let mut g = vec![0.0; plan.run()];
                 let weight = &ws[ch * taps..(ch + 1) * taps];
                 for image in 0..n {
                     let from = ch * plane + image * plan.plane();
-                    pad(&xs[from..from + plan.plane()], w, &mut padded, plan.wide, window.before);
+                    plan.split(&xs[from..from + plan.plane()], &mut phases);
                     let from = ch * out + image * plan.out_plane();
-                    for i in 0..plan.out_plane() {
-                        let (row, column) = (i / plan.out[1], i % plan.out[1]);
-                        let v = ys[from + i];
-                        let inside = v > 0.0 && v < 6.0;
-                        let v = if inside { gs[from + i] } else { 0.0 };
-                        g[(row * plan.wide + column) * window.stride] = v;
-                        *gb += v;
+                    let rows = ys[from..from + plan.out_plane()].chunks_exact(plan.out[1]);
+                    let rows =
+                        rows.zip(gs[from..from + plan.out_plane()].chunks_exact(plan.out[1]));
+                    for ((y, grad), g) in rows.zip(g.chunks_mut(plan.wide)) {
+                        for ((g, y), grad) in g.iter_mut().zip(y).zip(grad) {
+                            *g = if *y > 0.0 && *y < 6.0 { *grad } else { 0.0 };
+                        }
                     }
-                    for (t, offset) in plan.taps() {
-                        gw[t] += dot(&g, &padded[offset..offset + g.len()]);
+                    *gb += sum(&g);
+                    for (tap, from) in plan.taps() {
+                        gw[tap] += dot(&g, &phases[from..from + g.len()]);
                     }
                     if needs_x {
                         spread.fill(0.0);
-                        for (t, offset) in plan.taps() {
-                            let weight = weight[t];
-                            let run = &mut spread[offset..offset + g.len()];
-                            for (s, g) in run.iter_mut().zip(&g) {
+                        for (tap, from) in plan.taps() {
+                            let weight = weight[tap];
+                            for (s, g) in spread[from..].iter_mut().zip(&g) {
                                 *s += weight * g;
                             }
                         }
                         let gx = &mut gx[image * plan.plane()..(image + 1) * plan.plane()];
-                        for (y, row) in gx.chunks_exact_mut(w).enumerate() {
-                            let at = (y + window.before) * plan.wide + window.before;
-                            row.copy_from_slice(&spread[at..at + w]);
-                        }
+                        plan.join(&spread, gx);
                     }
                 }
             });

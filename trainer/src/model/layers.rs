@@ -172,31 +172,45 @@ pub(crate) fn conv_bn(
     activation.apply(conv2d(x, weight, Some(bias), conv.geometry.options()))
 }
 
-/// [`conv_bn`] for a 1x1 convolution of a batch-wide map: `(in, M)` to `(out, M)`.
-pub(crate) fn pointwise_bn_wide(
-    conv: &Conv,
-    bn: &FrozenBatchNorm,
-    activation: Activation,
-    x: Tensor<2>,
-) -> Tensor<2> {
-    let (weight, bias) = fold(conv, bn, true);
-    let [out, inp, _, _] = weight.dims();
-    let y = weight.reshape([out, inp]).matmul(x);
-    match activation {
-        Activation::Relu6 => kernels::bias_relu6(y, bias),
-        other => other.apply(y + bias.reshape([out, 1])),
-    }
+/// A convolution with its batch norm folded in, for batch-wide maps; see [`kernels`].
+#[derive(Clone, Debug)]
+pub(crate) struct WideConv {
+    /// `(out, in / groups * k * k)`.
+    weight: Tensor<2>,
+    /// `(out)`.
+    bias: Tensor<1>,
+    window: Window,
 }
 
-/// [`conv_bn`] for a depthwise convolution of a batch-wide map `(C, N, H, W)` with ReLU6.
-pub(crate) fn depthwise_bn_relu6_wide(
-    conv: &Conv,
-    bn: &FrozenBatchNorm,
-    x: Tensor<4>,
-) -> Tensor<4> {
-    let (weight, bias) = fold(conv, bn, true);
-    let [channels, _, k, _] = weight.dims();
-    kernels::depthwise_relu6(x, weight.reshape([channels, k * k]), bias, conv.geometry.window())
+impl WideConv {
+    /// Folds `bn` into `conv`; `on_graph` as in [`conv_bn`].
+    pub fn new(conv: &Conv, bn: &FrozenBatchNorm, on_graph: bool) -> Self {
+        let (weight, bias) = fold(conv, bn, on_graph);
+        let [out, inp, k, _] = weight.dims();
+        Self { weight: weight.reshape([out, inp * k * k]), bias, window: conv.geometry.window() }
+    }
+
+    /// 1x1 convolution with ReLU6, `(in, N, H, W)` to `(out, N, H, W)`.
+    pub fn pointwise_relu6(&self, x: Tensor<4>) -> Tensor<4> {
+        let [inp, n, h, w] = x.dims();
+        let y = self.weight.clone().matmul(x.reshape([inp, n * h * w]));
+        let y = kernels::bias_relu6(y, self.bias.clone());
+        let out = y.dims()[0];
+        y.reshape([out, n, h, w])
+    }
+
+    /// 1x1 convolution without activation, `(in, N, H, W)` to `(out, N, H, W)`.
+    pub fn pointwise(&self, x: Tensor<4>) -> Tensor<4> {
+        let [inp, n, h, w] = x.dims();
+        let y = self.weight.clone().matmul(x.reshape([inp, n * h * w]));
+        let out = y.dims()[0];
+        (y + self.bias.clone().reshape([out, 1])).reshape([out, n, h, w])
+    }
+
+    /// Depthwise convolution with ReLU6, `(C, N, H, W)` to `(C, N, H', W')`.
+    pub fn depthwise_relu6(&self, x: Tensor<4>) -> Tensor<4> {
+        kernels::depthwise_relu6(x, self.weight.clone(), self.bias.clone(), self.window)
+    }
 }
 
 /// Weight and bias of the convolution that equals `bn` after `conv`.
