@@ -16,6 +16,7 @@ import argparse
 import collections
 import hashlib
 import io
+import itertools
 import json
 import os
 import pickle
@@ -54,14 +55,20 @@ class Tensor:
 
     def bytes(self, name):
         """The tensor's numbers, row-major."""
-        numel = 1
+        width = STORAGES[self.storage.kind][1]
+        numel, row_major = 1, True
         for side, stride in zip(reversed(self.shape), reversed(self.stride)):
             # A side of 1 is never stepped along, so its stride says nothing.
-            if side > 1 and stride != numel:
-                raise Failed(f"tensor {name} is not stored row-major")
+            row_major &= side <= 1 or stride == numel
             numel *= side
-        width = STORAGES[self.storage.kind][1]
-        data = self.storage.data[self.offset * width:(self.offset + numel) * width]
+        data = self.storage.data
+        if row_major:
+            data = data[self.offset * width:(self.offset + numel) * width]
+        else:
+            steps = [range(0, side * stride, stride)
+                     for side, stride in zip(self.shape, self.stride)]
+            starts = (self.offset + sum(step) for step in itertools.product(*steps))
+            data = b"".join(data[at * width:(at + 1) * width] for at in starts)
         if len(data) != numel * width:
             raise Failed(f"tensor {name} ends behind its storage: the file is damaged")
         return data
