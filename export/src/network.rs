@@ -25,11 +25,10 @@ pub struct NetworkGraph {
 /// # Errors
 /// When the network uses an operation that the converter does not know.
 pub fn graphs(net: &TrackerNet) -> Result<Vec<NetworkGraph>, ExportError> {
-    let net = net.valid();
     let spec = *net.spec();
-    let mut graphs = vec![features(&net, &spec)?, template(&net, &spec)?];
+    let mut graphs = vec![features(net, &spec)?, template(net, &spec)?];
     for count in 1..=spec.templates {
-        graphs.push(predict(&net, &spec, count)?);
+        graphs.push(predict(net, &spec, count)?);
     }
     Ok(graphs)
 }
@@ -61,7 +60,7 @@ fn features(net: &TrackerNet, spec: &ModelSpec) -> Result<NetworkGraph, ExportEr
     let doc = "Head feature of a crop; run once per frame. The feature of a search frame goes to \
                predict, that of a frame to remember to template.";
     let graph = record("features", doc, |r| {
-        let net = r.module(net)?;
+        let net = r.module(net);
         let crop = format!(
             "crop (1, 3, {side}, {side}): batch, channel, row, column; R, G, B, (value / 255 - \
              mean) / std with mean {:?} and std {:?}; single-channel sensors repeat their value",
@@ -77,7 +76,7 @@ fn template(net: &TrackerNet, spec: &ModelSpec) -> Result<NetworkGraph, ExportEr
     let (d, f) = (usize::from(spec.width), spec.map_side());
     let doc = "Tokens of a frame to remember; run once per memory write.";
     let graph = record("template", doc, |r| {
-        let net = r.module(net)?;
+        let net = r.module(net);
         let feature = r.input("feature", [1, d, f, f], &feature_doc(spec))?;
         let label = format!(
             "label ({f}, {f}): Gaussian of height 1 at the target's centre, sigma {} cells",
@@ -99,7 +98,7 @@ fn predict(net: &TrackerNet, spec: &ModelSpec, count: u8) -> Result<NetworkGraph
     let (d, f) = (usize::from(spec.width), spec.map_side());
     let doc = format!("Score map and boxes of a search frame against {count} template(s).");
     let graph = record(&format!("predict{count}"), &doc, |r| {
-        let net = r.module(net)?;
+        let net = r.module(net);
         let templates = (0..count)
             .map(|slot| {
                 let which = if slot == 0 { " of the annotated first frame" } else { "" };

@@ -18,15 +18,6 @@ pub enum ExportError {
         /// What exactly is not supported, and what to use in its place.
         reason: String,
     },
-    /// The module lives on a device that records gradients.
-    #[error(
-        "graph `{graph}`: the module is on an autodiff device, which cannot be recorded; pass \
-         `module.valid()`"
-    )]
-    Autodiff {
-        /// Name of the graph being recorded.
-        graph: String,
-    },
     /// burn's graph capture refused the recording.
     #[error("graph `{graph}`: recording failed: {reason}")]
     Capture {

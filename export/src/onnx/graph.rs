@@ -206,10 +206,15 @@ impl Graph {
         id
     }
 
-    /// Gives a tensor another name, made unique.
-    pub fn rename(&mut self, id: ValueId, name: &str) {
-        let name = self.unique(name);
-        self.values[id.0].name = name;
+    /// Exchanges the names of two tensors.
+    pub(crate) fn swap_names(&mut self, a: ValueId, b: ValueId) {
+        let name = std::mem::take(&mut self.values[a.0].name);
+        self.values[a.0].name = std::mem::replace(&mut self.values[b.0].name, name);
+    }
+
+    /// Reads the same elements as a tensor of another shape.
+    pub(crate) fn set_dims(&mut self, id: ValueId, dims: &[usize]) {
+        self.values[id.0].dims = dims.to_vec();
     }
 
     pub(crate) fn set_constant(&mut self, id: ValueId, data: Data) {

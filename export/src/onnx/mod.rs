@@ -10,8 +10,7 @@
 //! 3. [`encode`] writes the file, its weights inside or in a [`WeightStore`] shared by any number
 //!    of graphs.
 //!
-//! The module has to be off the autodiff device (`module.valid()`): batch norm would otherwise use
-//! batch statistics.
+//! Modules are recorded in their inference form ([`burn::module::Module::valid`]), wherever they are.
 
 mod convert;
 mod emit;

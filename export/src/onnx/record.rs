@@ -35,19 +35,15 @@ impl Recorder {
         &self.device
     }
 
-    /// A copy of `module` whose computations are recorded. Its parameters are named by their path
-    /// in the module.
-    ///
-    /// # Errors
-    /// When the module is on an autodiff device.
-    pub fn module<M: Module>(&mut self, module: &M) -> Result<M, ExportError> {
-        if module.devices().iter().any(Device::is_autodiff) {
-            return Err(ExportError::Autodiff { graph: self.graph.clone() });
-        }
-        let module = module.clone().to_device(&self.device);
+    /// A copy of `module`, in its inference form, whose computations are recorded. Its parameters
+    /// are named by their path in the module.
+    pub fn module<M: Module>(&mut self, module: &M) -> M {
+        // `valid` takes it off an autodiff device, where batch norm would use batch statistics,
+        // and separates running statistics, which clones share and `to_device` moves in place.
+        let module = module.valid().to_device(&self.device);
         let mut namer = Namer { path: Vec::new(), names: &mut self.names };
         module.visit(&mut namer);
-        Ok(module)
+        module
     }
 
     /// A tensor that the caller of the graph provides.

@@ -10,7 +10,7 @@ use super::graph::{Attribute, Data, Elem, Graph, Node, Port, ValueId};
 use super::record::Recorder;
 use burn::backend::ir::{OperationIr, ScalarIr, TensorId, TensorIr};
 use burn::tensor::{CapturedGraph, DType, TensorData};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 /// Why one operation could not be converted; [`Converter::run`] adds which one it was.
 pub(super) enum Refusal {
@@ -33,8 +33,12 @@ pub(super) struct Converter<'a> {
     recorder: &'a Recorder,
     values: HashMap<TensorId, ValueId>,
     constants: &'a BTreeMap<TensorId, TensorData>,
-    /// Name for the output of the operation being converted.
+    /// Layer the operation being converted belongs to; names what it computes.
     scope: String,
+    /// The layer of everything converted so far.
+    scopes: HashMap<TensorId, String>,
+    /// Tensors that depend on no input.
+    fixed: HashSet<TensorId>,
 }
 
 impl<'a> Converter<'a> {
@@ -46,6 +50,8 @@ impl<'a> Converter<'a> {
             values: HashMap::new(),
             constants: &captured.values,
             scope: String::new(),
+            scopes: HashMap::new(),
+            fixed: captured.values.keys().copied().collect(),
         }
     }
 
@@ -58,6 +64,7 @@ impl<'a> Converter<'a> {
             let dims = self.input_dims(*id, &shapes);
             let value = self.graph.add_value(&port.name, &dims, Elem::F32);
             self.values.insert(*id, value);
+            self.fixed.remove(id);
             self.graph.inputs.push(Port { value, doc: port.doc.clone() });
         }
         // Outputs keep their declared names, so nothing else may take them.
@@ -101,7 +108,8 @@ impl<'a> Converter<'a> {
             let dims: Vec<usize> = data.shape().iter().copied().collect();
             let Ok(data) = constant(data) else { return Err(unknown()) };
             let source = self.graph.add_constant("constant", &dims, data);
-            return Ok(self.identity(source, value));
+            self.identity(source, value);
+            return Ok(());
         };
         match self.graph.nodes.iter_mut().find(|n| n.output == source) {
             Some(node) => {
@@ -129,7 +137,7 @@ impl<'a> Converter<'a> {
     }
 
     fn operation(&mut self, operation: &OperationIr) -> Converted {
-        self.scope = self.scope_of(operation);
+        self.place(operation);
         match operation {
             // Initial values are looked up where they are read.
             OperationIr::Init(_) | OperationIr::Drop(_) => Ok(()),
@@ -146,14 +154,28 @@ impl<'a> Converter<'a> {
         }
     }
 
-    /// `backbone.layer1.0.conv1` for an operation that reads `backbone.layer1.0.conv1.weight`,
-    /// otherwise the operation's own name.
-    fn scope_of(&self, operation: &OperationIr) -> String {
-        operation
-            .inputs()
-            .filter_map(|t| self.recorder.names.get(&t.id))
-            .find_map(|name| name.rsplit_once('.').map(|(parent, _)| parent.to_owned()))
-            .unwrap_or_default()
+    /// Finds the layer of an operation: `backbone.layer1.0.conv1` where it reads
+    /// `backbone.layer1.0.conv1.weight` or something computed from that alone, otherwise the layer
+    /// of its last input, so that activations and sums go by the layer before them.
+    fn place(&mut self, operation: &OperationIr) {
+        let inputs: Vec<TensorId> = operation.inputs().map(|t| t.id).collect();
+        let parent = |id| self.recorder.names.get(id)?.rsplit_once('.').map(|(parent, _)| parent);
+        let known = |id| self.scopes.get(id).map(String::as_str);
+        let own = inputs.iter().find_map(parent);
+        let weights = || inputs.iter().filter(|id| self.fixed.contains(id)).find_map(known);
+        let before = || inputs.iter().rev().find_map(known);
+        let scope = own.or_else(weights).or_else(before).unwrap_or_default().to_owned();
+        let fixed = inputs.iter().all(|id| self.fixed.contains(id));
+        for out in operation.outputs() {
+            // Initialised tensors are no results; they have their own names.
+            if !matches!(operation, OperationIr::Init(_) | OperationIr::Drop(_)) {
+                self.scopes.insert(out.id, scope.clone());
+                if fixed {
+                    self.fixed.insert(out.id);
+                }
+            }
+        }
+        self.scope = scope;
     }
 
     /// The tensor of the graph that stands for `tensor`; constants are added on first use.
@@ -262,7 +284,7 @@ fn shapes(operations: &[OperationIr]) -> HashMap<TensorId, Vec<usize>> {
 
 /// Which operations the outputs depend on.
 fn needed(operations: &[OperationIr], outputs: &[TensorId]) -> Vec<bool> {
-    let mut wanted: std::collections::HashSet<TensorId> = outputs.iter().copied().collect();
+    let mut wanted: HashSet<TensorId> = outputs.iter().copied().collect();
     let mut needed = vec![false; operations.len()];
     for (i, operation) in operations.iter().enumerate().rev() {
         let passive = matches!(operation, OperationIr::Drop(_));

@@ -1,4 +1,4 @@
-//! Batch norm, per-channel scales and shifts, and zero padding into convolutions.
+//! Batch norm, per-channel scales and shifts, and zero padding into convolutions and products.
 
 use super::super::graph::{Attribute, Data, Graph, Node, ValueId};
 
@@ -112,6 +112,64 @@ fn per_channel(graph: &Graph, id: ValueId, out: &[usize]) -> Option<Vec<f64>> {
     let others = dims.iter().enumerate().all(|(i, side)| i == axis || *side == 1);
     (others && dims.get(axis) == Some(&channels) && values.len() == channels)
         .then(|| values.iter().map(|v| f64::from(*v)).collect())
+}
+
+/// Folds batch norm behind `x W + b` (tokens by channels) into `W` and `b`.
+pub(super) fn into_products(graph: &mut Graph) -> bool {
+    let uses = graph.uses();
+    let mut changed = false;
+    for i in 0..graph.nodes.len() {
+        if let Some((product, weight, bias)) = product_and_bias(graph, i, &uses) {
+            graph.nodes[product].inputs[1] = Some(weight);
+            // The norm's place becomes the sum's; the sum, now unread, goes as dead.
+            let read = Some(graph.nodes[product].output);
+            let output = graph.nodes[i].output;
+            graph.nodes[i] =
+                Node { op: "Add", inputs: vec![read, Some(bias)], output, attributes: vec![] };
+            changed = true;
+        }
+    }
+    changed
+}
+
+/// For a batch norm at `i` behind a biased product: the product, its new matrix and bias.
+fn product_and_bias(
+    graph: &mut Graph,
+    i: usize,
+    uses: &std::collections::HashMap<ValueId, usize>,
+) -> Option<(usize, ValueId, ValueId)> {
+    let node = &graph.nodes[i];
+    if node.op != "BatchNormalization" || graph.dims(node.output).len() != 2 {
+        return None;
+    }
+    let effect = effect(graph, node, 0)?;
+    let channels = effect.scale.len();
+    let source = |id: ValueId, op: &str| {
+        let at = graph.nodes[..i].iter().position(|n| n.output == id && n.op == op)?;
+        (uses.get(&id) == Some(&1)).then_some(at)
+    };
+    let sum = &graph.nodes[source(node.input(0)?, "Add")?];
+    let slot = [0, 1]
+        .into_iter()
+        .find(|s| sum.input(1 - s).is_some_and(|b| graph.constant(b).is_some()))?;
+    let product = source(sum.input(slot)?, "MatMul")?;
+    let bias = graph.constant(sum.input(1 - slot)?)?.f32s()?;
+    let weight_id = graph.nodes[product].input(1)?;
+    let (dims, weight) = (graph.dims(weight_id).to_vec(), graph.constant(weight_id)?.f32s()?);
+    if dims.len() != 2 || dims[1] != channels || bias.len() != channels {
+        return None;
+    }
+    let scaled = (weight.iter().enumerate())
+        .map(|(j, w)| (f64::from(*w) * effect.scale[j % channels]) as f32)
+        .collect();
+    let shifted = (bias.iter().enumerate())
+        .map(|(c, b)| (f64::from(*b) * effect.scale[c] + effect.shift[c]) as f32)
+        .collect();
+    let name = format!("{}.folded", graph.value(weight_id).name);
+    let weight = graph.add_constant(&name, &dims, Data::F32(scaled));
+    let name = name.replace("weight.folded", "bias.folded");
+    let bias = graph.add_constant(&name, &[channels], Data::F32(shifted));
+    Some((product, weight, bias))
 }
 
 /// Zero padding of the spatial sides that only convolutions read becomes their own.

@@ -9,11 +9,10 @@ pub(super) fn no_ops(graph: &mut Graph) -> bool {
     let mut changed = false;
     let mut i = 0;
     while i < graph.nodes.len() {
-        if let Some(input) = passes_through(graph, &graph.nodes[i]) {
-            if remove(graph, i, input) {
-                changed = true;
-                continue;
-            }
+        let same = passes_through(graph, &graph.nodes[i]);
+        if same.is_some_and(|input| remove(graph, i, input)) {
+            changed = true;
+            continue;
         }
         changed |= join_with_source(graph, i) | read_unexpanded(graph, i);
         i += 1;
@@ -121,6 +120,34 @@ fn read_unexpanded(graph: &mut Graph, i: usize) -> bool {
     let Some((slot, origin)) = replaced else { return false };
     graph.nodes[i].inputs[slot] = Some(origin);
     true
+}
+
+/// Products with a constant matrix read it as a plain matrix: engines know that form best.
+pub(super) fn plain_matrices(graph: &mut Graph) -> bool {
+    let uses = graph.uses();
+    let mut changed = false;
+    for i in 0..graph.nodes.len() {
+        let node = &graph.nodes[i];
+        if node.op != "MatMul" {
+            continue;
+        }
+        let (Some(lhs), Some(rhs)) = (node.input(0), node.input(1)) else { continue };
+        let dims = graph.dims(rhs);
+        let stacked = dims.len() > 2 && dims[..dims.len() - 2].iter().all(|side| *side == 1);
+        if !stacked || graph.dims(lhs).len() < dims.len() {
+            continue;
+        }
+        let matrix = dims[dims.len() - 2..].to_vec();
+        let Some(data) = graph.constant(rhs) else { continue };
+        if uses.get(&rhs) == Some(&1) {
+            graph.set_dims(rhs, &matrix);
+        } else {
+            let (data, name) = (data.clone(), graph.value(rhs).name.clone());
+            graph.nodes[i].inputs[1] = Some(graph.add_constant(&name, &matrix, data));
+        }
+        changed = true;
+    }
+    changed
 }
 
 /// Shape of two tensors broadcast against each other.

@@ -14,6 +14,7 @@ const LARGEST: usize = 1 << 20;
 /// larger: their value is known to what follows, but where it is read directly it is computed when
 /// the model is loaded.
 pub(super) fn constants(graph: &mut Graph) -> bool {
+    let uses = graph.uses();
     let mut changed = false;
     let mut i = 0;
     while i < graph.nodes.len() {
@@ -32,6 +33,11 @@ pub(super) fn constants(graph: &mut Graph) -> bool {
             continue;
         };
         let repeats = matches!(node.op, "Expand" | "Tile" | "Concat") && size > held.max(64);
+        // A reshaped weight keeps its name.
+        let renamed = (node.op == "Reshape").then(|| node.input(0)).flatten();
+        if let Some(source) = renamed.filter(|id| uses.get(id) == Some(&1)) {
+            graph.swap_names(source, output);
+        }
         graph.set_constant(output, data);
         changed = true;
         if repeats {

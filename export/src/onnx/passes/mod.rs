@@ -8,16 +8,17 @@ use super::graph::{Graph, ValueId};
 use std::collections::HashSet;
 
 /// Simplifies until nothing changes: computes constant parts, folds scales and shifts (batch norm)
-/// into convolutions and padding into their windows, drops operations without effect and what no
-/// output needs, joins equal computations. Finally names every tensor after the layer it belongs
-/// to.
+/// into convolutions and matrix products, and padding into windows, drops operations without effect
+/// and what no output needs, joins equal computations.
 pub fn optimise(graph: &mut Graph) {
-    let passes: [fn(&mut Graph) -> bool; 6] = [
+    let passes: [fn(&mut Graph) -> bool; 8] = [
         remove_dead,
         fold::constants,
         cleanup::no_ops,
         affine::into_convolutions,
+        affine::into_products,
         affine::padding_into_convolutions,
+        cleanup::plain_matrices,
         cleanup::join_equal,
     ];
     // Every pass that reports a change has made the graph smaller or a value constant.
