@@ -1,1 +1,22 @@
-//! stub
+//! The tracker on the board: frames in, boxes and pictures out.
+//!
+//! The pieces of the program `tsda`, in the order a frame meets them:
+//! 1. [`frames`]: folders, lists that mix sensors, Y4M on a pipe; [`sequence`]: clips with known
+//!    boxes; [`render`]: the clip the project draws itself.
+//! 2. [`model`]: the embedded bundle or one from a file, and the tracker built from it.
+//! 3. [`track`]: drives a tracker on any engine through a source into outputs.
+//! 4. [`video`]: GIF, page, PNG files, strip; [`metrics`]: figures against known boxes.
+//! 5. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
+//!    appear whole or not at all.
+
+pub mod cli;
+pub mod error;
+pub mod frames;
+pub mod metrics;
+pub mod model;
+pub mod output;
+pub mod picture;
+pub mod render;
+pub mod sequence;
+pub mod track;
+pub mod video;

@@ -1,1 +1,17 @@
-fn main() {}
+//! `tsda`: track a target through frames of two sensors.
+
+use clap::Parser as _;
+use std::process::ExitCode;
+use tsda_host::cli::{Cli, execute};
+use tsda_host::error::one_line;
+
+fn main() -> ExitCode {
+    // Usage errors end inside `parse`, with clap's code 2.
+    match execute(&Cli::parse()) {
+        Ok(code) => ExitCode::from(code),
+        Err(e) => {
+            eprintln!("tsda: {}", one_line(&e));
+            ExitCode::from(e.exit_code())
+        }
+    }
+}

@@ -1,0 +1,109 @@
+//! `tsda info`.
+
+use super::{InfoArgs, grouped};
+use crate::error::{EXIT_OK, HostError};
+use crate::model;
+use std::fmt::Write as _;
+use tsda_runtime::Backbone;
+use tsda_runtime::bundle::{Bundle, SectionKind};
+
+pub(super) fn run(args: &InfoArgs) -> Result<u8, HostError> {
+    let file = model::load(args.bundle.as_deref())?;
+    print!("{}", describe(&file.path().display().to_string(), &file.bundle()?));
+    Ok(EXIT_OK)
+}
+
+/// Everything the manifest says, for people.
+fn describe(path: &str, bundle: &Bundle<'_>) -> String {
+    let m = bundle.manifest();
+    let mut text = String::new();
+    let mut row = |key: &str, value: String| {
+        if !value.trim().is_empty() {
+            // Writing to a string does not fail.
+            let _ = writeln!(text, "{key:<14} {value}");
+        }
+    };
+    row("bundle", path.to_owned());
+    row("name", m.name.to_owned());
+    row("size", format!("{} bytes", grouped(bundle.bytes().len() as u64)));
+    let s = &m.spec;
+    let backbone = match s.backbone {
+        Backbone::EfficientNetLite0 => "EfficientNet-Lite0 to stride 16".to_owned(),
+        Backbone::ResNet { base_channels, blocks } => {
+            format!("ResNet, {base_channels} channels, blocks {blocks:?}")
+        }
+    };
+    row("backbone", backbone);
+    row(
+        "input",
+        format!(
+            "{0} x {0} pixels, {1} times the target's size; maps {2} x {2}",
+            s.crop,
+            s.search_factor,
+            s.map_side()
+        ),
+    );
+    row(
+        "transformer",
+        format!(
+            "width {}, {} heads, feed-forward {}, {} + {} layers, {} templates",
+            s.width, s.heads, s.feed_forward, s.encoder_layers, s.decoder_layers, s.templates
+        ),
+    );
+    if let Some(weights) = bundle.section(SectionKind::Weights) {
+        row(
+            "weights",
+            format!(
+                "{} bytes, about {} numbers of 32 bits",
+                grouped(weights.len() as u64),
+                grouped(weights.len() as u64 / 4)
+            ),
+        );
+    }
+    let t = m.trained_on;
+    let mut sensors: Vec<&str> = Vec::new();
+    for (is, name) in [(t.rgb, "rgb"), (t.thermal, "thermal"), (t.cross_modal, "across both")] {
+        if is {
+            sensors.push(name);
+        }
+    }
+    row("trained on", sensors.join(", "));
+    let p = &m.tracker;
+    row(
+        "thresholds",
+        format!(
+            "not found below {}, remembered above {}, lost after {} frames",
+            p.not_found, p.write_confidence, p.lost_after
+        ),
+    );
+    if let Some(c) = m.calibration {
+        row("calibration", format!("slope {}, bias {}", c.slope, c.bias));
+    }
+    row("trainer", m.provenance.trainer.to_owned());
+    row("steps, seed", format!("{}, {}", m.provenance.steps, m.provenance.seed));
+    row("weights crc", format!("{:08x}", m.provenance.weights_crc));
+    row("licence", m.licence.to_owned());
+    text.push_str("\nsections\n");
+    for s in &m.sections {
+        let _ = writeln!(
+            text,
+            "  {:<16} {:>12} bytes at {:>10}  crc {:08x}",
+            s.kind.to_string(),
+            grouped(s.length),
+            s.offset,
+            s.crc
+        );
+    }
+    if !m.figures.is_empty() {
+        text.push_str("\nfigures\n");
+        for f in &m.figures {
+            let _ = writeln!(text, "  {:<40} {:.4}", f.name, f.value);
+        }
+    }
+    for (title, body) in [("data", m.provenance.data), ("card", m.card)] {
+        if !body.trim().is_empty() {
+            let _ = writeln!(text, "\n{title}\n{}", body.trim_end());
+        }
+    }
+    text
+}

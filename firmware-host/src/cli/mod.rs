@@ -1,0 +1,216 @@
+//! The command line: what was typed ([`Cli`]) and what it does ([`execute`]).
+
+mod demo;
+#[cfg(feature = "camera")]
+mod devices;
+#[cfg(feature = "eval")]
+mod eval;
+mod info;
+mod track;
+mod verify;
+
+use crate::error::HostError;
+use clap::{Args, Parser, Subcommand};
+use indicatif::{ProgressBar, ProgressStyle};
+use std::path::PathBuf;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Tracks one target through frames of a visible and a thermal camera.
+#[derive(Debug, Parser)]
+#[command(
+    name = "tsda",
+    version,
+    after_help = "\
+Exit codes: 0 done, 1 a check failed, 2 the input cannot be used, 3 the work failed or was interrupted."
+)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Track through a rendered RGB-thermal clip (or a sequence folder) and show how well it went
+    Demo(DemoArgs),
+    /// Track through frames: a folder of pictures, a list that mixes sensors, or Y4M video on stdin
+    Track(TrackArgs),
+    /// Print what a bundle says about itself
+    Info(InfoArgs),
+    /// Check every engine of this build against the reference outputs stored in the bundle
+    Verify(VerifyArgs),
+    /// Evaluate a bundle on a dataset under cross-modal protocols
+    #[cfg(feature = "eval")]
+    Eval(EvalArgs),
+    /// List V4L2 cameras and their formats
+    #[cfg(feature = "camera")]
+    Devices,
+}
+
+/// Arguments of `tsda demo`.
+#[derive(Debug, Args)]
+pub struct DemoArgs {
+    /// Sequence folder with visible/ and infrared/ pictures and box files, instead of the rendered
+    /// clip
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
+    /// Folder for the results, made if needed
+    #[arg(long, value_name = "DIR", default_value = "tsda-demo")]
+    pub out: PathBuf,
+    /// Change the sensor every N frames instead of once in the middle
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub switch_every: Option<u32>,
+    /// Bundle to track with, instead of the embedded one
+    #[arg(long, value_name = "FILE.tsda")]
+    pub bundle: Option<PathBuf>,
+    /// Seed of the rendered clip
+    #[arg(long, default_value_t = 7, conflicts_with = "data")]
+    pub seed: u32,
+}
+
+/// Arguments of `tsda track`.
+#[derive(Debug, Args)]
+pub struct TrackArgs {
+    /// Folder of pictures, text list (one path per line, optionally TAB rgb|thermal), .y4m file, or
+    /// - for Y4M on stdin
+    #[arg(long, value_name = "DIR|LIST|-")]
+    pub frames: PathBuf,
+    /// Bundle to track with, instead of the embedded one
+    #[arg(long, value_name = "FILE.tsda")]
+    pub bundle: Option<PathBuf>,
+    /// Box of the target in the first frame, in pixels; without it, the first line of a box file
+    /// beside the frames
+    #[arg(long, value_name = "X,Y,W,H", allow_hyphen_values = true)]
+    pub init: Option<String>,
+    /// Boxes, one line x,y,w,h per frame
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// One JSON object per frame: box, score, state, sensor, time; - for standard output
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+    /// Pictures of the result: folder of PNG, .gif, .html page, or .png strip; may be repeated
+    #[arg(long, value_name = "DIR|FILE")]
+    pub video_out: Vec<PathBuf>,
+    /// Known boxes, one line per frame: drawn thin, and compared with at the end
+    #[arg(long, value_name = "FILE")]
+    pub truth: Option<PathBuf>,
+    /// Sensor of a Y4M stream, instead of guessing from its colours
+    #[arg(long, value_name = "rgb|thermal", value_parser = parse_modality)]
+    pub modality: Option<tsda_runtime::Modality>,
+}
+
+/// Arguments of `tsda info`.
+#[derive(Debug, Args)]
+pub struct InfoArgs {
+    /// Bundle; without it, the embedded one
+    #[arg(value_name = "FILE.tsda")]
+    pub bundle: Option<PathBuf>,
+}
+
+/// Arguments of `tsda verify`.
+#[derive(Debug, Args)]
+pub struct VerifyArgs {
+    /// Bundle; without it, the embedded one
+    #[arg(value_name = "FILE.tsda")]
+    pub bundle: Option<PathBuf>,
+    /// Largest absolute difference allowed
+    #[arg(long, default_value_t = 1e-4)]
+    pub tolerance: f32,
+}
+
+/// Arguments of `tsda eval`.
+#[cfg(feature = "eval")]
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// Bundle to evaluate, instead of the embedded one
+    #[arg(long, value_name = "FILE.tsda")]
+    pub bundle: Option<PathBuf>,
+    /// sequences:PATH[@split] for clips, pseudo:PATH[@split] for clips made from registered stills
+    #[arg(long, value_name = "KIND:PATH[@SPLIT]")]
+    pub dataset: String,
+    /// rgb2t, t2rgb, switch:N, rgb or t; may be repeated [default: rgb2t t2rgb switch:20]
+    #[arg(long, value_name = "PROTOCOL")]
+    pub protocol: Vec<tsda_eval::protocol::Protocol>,
+    /// Folder for summary.json, summary.md and the boxes, made if needed
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Also run a static box and template matching
+    #[arg(long)]
+    pub baselines: bool,
+    /// Sequences tracked at a time
+    #[arg(long, default_value_t = 1)]
+    pub threads: usize,
+    /// Frames per clip made from stills
+    #[arg(long, value_name = "N", default_value_t = 60)]
+    pub pseudo_frames: usize,
+}
+
+fn parse_modality(text: &str) -> Result<tsda_runtime::Modality, String> {
+    match text {
+        "rgb" => Ok(tsda_runtime::Modality::Rgb),
+        "thermal" => Ok(tsda_runtime::Modality::Thermal),
+        _ => Err("expected rgb or thermal".into()),
+    }
+}
+
+/// Runs a command; answers the exit code.
+///
+/// # Errors
+/// Any failure; [`HostError::exit_code`] has the code for it.
+pub fn execute(cli: &Cli) -> Result<u8, HostError> {
+    match &cli.command {
+        Command::Demo(args) => demo::run(args),
+        Command::Track(args) => track::run(args),
+        Command::Info(args) => info::run(args),
+        Command::Verify(args) => verify::run(args),
+        #[cfg(feature = "eval")]
+        Command::Eval(args) => eval::run(args),
+        #[cfg(feature = "camera")]
+        Command::Devices => devices::run(),
+    }
+}
+
+/// A flag that Ctrl-C and SIGTERM set; a second signal ends the program at once.
+fn stop_flag() -> &'static AtomicBool {
+    static STOP: AtomicBool = AtomicBool::new(false);
+    static HANDLER: OnceLock<()> = OnceLock::new();
+    HANDLER.get_or_init(|| {
+        // Without a handler (two programs fighting over it) Ctrl-C simply ends the program; the
+        // temporary names then show what is unfinished.
+        let _ = ctrlc::set_handler(|| {
+            if STOP.swap(true, Ordering::Relaxed) {
+                std::process::exit(i32::from(crate::error::EXIT_RUNTIME));
+            }
+        });
+    });
+    &STOP
+}
+
+/// A progress bar on standard error, hidden when that is no terminal.
+fn progress_bar(total: Option<usize>, what: &'static str) -> ProgressBar {
+    let (bar, template) = match total {
+        Some(n) => {
+            (ProgressBar::new(n as u64), "{prefix} [{bar:30}] {pos}/{len} {msg} {eta_precise}")
+        }
+        None => (ProgressBar::new_spinner(), "{prefix} {pos} {msg}"),
+    };
+    if let Ok(style) = ProgressStyle::with_template(template) {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    bar.with_prefix(what)
+}
+
+/// `12,345,678`.
+fn grouped(n: u64) -> String {
+    let digits = n.to_string();
+    let mut out = String::new();
+    for (i, c) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(c);
+    }
+    out
+}

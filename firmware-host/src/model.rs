@@ -1,0 +1,54 @@
+//! The model to track with: a bundle file, or the one built into the program.
+
+use crate::error::HostError;
+use std::path::Path;
+use tsda_runtime::Tracker;
+use tsda_runtime::bundle::{Bundle, BundleFile};
+use tsda_runtime::engine::tract::TractEngine;
+
+/// `models/nano.tsda` of the repository at build time.
+static EMBEDDED: Option<&[u8]> = include!(concat!(env!("OUT_DIR"), "/embedded.rs"));
+
+/// Name of the embedded model in messages.
+pub const EMBEDDED_NAME: &str = "embedded nano.tsda";
+
+/// The bytes of the embedded model, when this build has one.
+pub fn embedded() -> Option<&'static [u8]> {
+    EMBEDDED
+}
+
+/// Reads and verifies a bundle; without a path, the embedded one.
+///
+/// # Errors
+/// When the file is missing, damaged or newer than this program, or nothing is embedded.
+pub fn load(path: Option<&Path>) -> Result<BundleFile, HostError> {
+    match path {
+        Some(path) => Ok(BundleFile::open(path)?),
+        None => {
+            let bytes = EMBEDDED.ok_or(HostError::NoEmbeddedModel)?;
+            Ok(BundleFile::from_bytes(EMBEDDED_NAME, bytes.to_vec())?)
+        }
+    }
+}
+
+/// A tracker on the default engine, with the thresholds the bundle was tuned with.
+///
+/// # Errors
+/// When the engine cannot be built from the bundle's graphs.
+pub fn tracker(file: &BundleFile) -> Result<Tracker<TractEngine>, HostError> {
+    let bundle = file.bundle()?;
+    let params = bundle.manifest().tracker;
+    Tracker::new(engine(file, &bundle)?, params)
+        .map_err(|source| HostError::Tracker { frame: 0, source: Box::new(source) })
+}
+
+/// The default engine.
+///
+/// # Errors
+/// When it cannot be built from the bundle's graphs.
+pub fn engine(file: &BundleFile, bundle: &Bundle<'_>) -> Result<TractEngine, HostError> {
+    TractEngine::from_bundle(bundle).map_err(|source| HostError::Engine {
+        bundle: file.path().to_path_buf(),
+        source: Box::new(source),
+    })
+}
