@@ -1,7 +1,7 @@
 //! Cutting the search area out of a picture, straight into the network's input (spec 3.3, 3.4).
 //!
 //! [`Window::new`] turns a position and a size into whole pixels and real-valued coordinates;
-//! [`reference`] reads just those pixels of the picture that the resampling needs, in the picture's
+//! [`reference()`] reads just those pixels of the picture that the resampling needs, in its
 //! own format, and writes normalised planes. Nothing is copied or converted as a whole, so the cost
 //! follows the crop and not the sensor.
 //!

@@ -364,5 +364,5 @@ pub fn encode(
     Ok(bytes)
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "std"))]
 mod tests;

@@ -18,7 +18,7 @@
 #[cfg(feature = "std")]
 mod file;
 mod manifest;
-#[cfg(test)]
+#[cfg(all(test, feature = "std"))]
 mod tests;
 
 #[cfg(feature = "std")]

@@ -172,7 +172,6 @@ fn every_truncation_is_an_error() {
     }
 }
 
-#[cfg(feature = "std")]
 #[test]
 fn file_errors_name_the_file() {
     let path = "no/such/folder/model.tsda";
