@@ -300,8 +300,8 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(PARTIAL);
     let partial = path.with_file_name(name);
-    let written =
-        write_synced(&partial, bytes).and_then(|()| fs::rename(&partial, path).map_err(io("rename", path)));
+    let written = write_synced(&partial, bytes)
+        .and_then(|()| fs::rename(&partial, path).map_err(io("rename", path)));
     if written.is_err() {
         let _ = fs::remove_file(&partial);
     }
@@ -358,7 +358,11 @@ mod tests {
             let latest = store.latest().unwrap();
             assert_eq!(latest.checkpoint.unwrap().step, 1, "{name}");
             assert_eq!(latest.skipped.len(), 1, "{name}");
-            assert!(latest.skipped[0].contains("checkpoint-000002"), "{name}: {:?}", latest.skipped);
+            assert!(
+                latest.skipped[0].contains("checkpoint-000002"),
+                "{name}: {:?}",
+                latest.skipped
+            );
             // Training on overwrites the damaged one.
             put(&store, 2);
             assert_eq!(store.latest().unwrap().checkpoint.unwrap().step, 2, "{name}");

@@ -18,3 +18,5 @@ pub mod model;
 pub mod prefetch;
 pub mod processing;
 pub mod sampler;
+#[cfg(test)]
+mod testing;

@@ -55,7 +55,11 @@ fn values_out_of_range_name_field_and_line() {
         ("optim", "eps = 0.0", "optim.eps"),
         ("optim", "clip_norm = -inf", "optim.clip_norm"),
         ("optim", "dropout = 1.0", "optim.dropout"),
-        ("optim", "schedule = { kind = \"step\", at = [0.5, nan], gamma = 0.2 }", "optim.schedule.at"),
+        (
+            "optim",
+            "schedule = { kind = \"step\", at = [0.5, nan], gamma = 0.2 }",
+            "optim.schedule.at",
+        ),
         ("sampler", "cross_modal_p = 1.5", "sampler.cross_modal_p"),
         ("sampler", "templates = 0", "sampler.templates"),
         ("sampler", "templates = 3", "sampler.templates"),

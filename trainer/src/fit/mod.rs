@@ -297,15 +297,13 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
     notes.iter().for_each(|note| progress.line(note));
 
     let end = options.stop_after.map_or(total, |s| s.min(total));
-    let weights =
-        LossWeights { classification: experiment.loss.cls, giou: experiment.loss.reg };
+    let weights = LossWeights { classification: experiment.loss.cls, giou: experiment.loss.reg };
     let backbone = optim::backbone_group().map_err(FitError::Device)?;
     let source = maker.clone();
-    let mut batches =
-        Prefetcher::new(state.step..end, run.workers, run.workers + 1, move |step| {
-            source.step(step)
-        })
-        .map_err(|source| FitError::Batch { step: state.step, source })?;
+    let mut batches = Prefetcher::new(state.step..end, run.workers, run.workers + 1, move |step| {
+        source.step(step)
+    })
+    .map_err(|source| FitError::Batch { step: state.step, source })?;
     let mut window = Window::new(run.batch);
     let mut last = None;
     let mut saved = state.step;
@@ -322,7 +320,8 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
             Ok(figures) => figures,
             Err(e) => {
                 if let FitError::NotFinite { what, ids, .. } = &e {
-                    log.entry("not_finite", step, &BadBatch { what, ids }, &[]).map_err(log_error)?;
+                    log.entry("not_finite", step, &BadBatch { what, ids }, &[])
+                        .map_err(log_error)?;
                 }
                 return Err(e);
             }
@@ -345,7 +344,8 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
             ];
             log.entry("train", state.step, &e, &scalars).map_err(log_error)?;
         }
-        let due = run.validate_every > 0 && (state.step.is_multiple_of(run.validate_every) || finished);
+        let due =
+            run.validate_every > 0 && (state.step.is_multiple_of(run.validate_every) || finished);
         if let (true, Some(maker)) = (due, &validation) {
             let net = state.inference_net();
             let plain = options.device.clone();
@@ -360,7 +360,9 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
             progress.validation(state.step, &v);
             let scalars: Vec<(&str, f64)> = [("same", v.same), ("cross", v.cross), ("all", v.all)]
                 .iter()
-                .flat_map(|(group, g)| scalar_names(group).into_iter().zip([g.cls, g.giou, g.iou, g.success]))
+                .flat_map(|(group, g)| {
+                    scalar_names(group).into_iter().zip([g.cls, g.giou, g.iou, g.success])
+                })
                 .collect();
             log.entry("validation", state.step, &v, &scalars).map_err(log_error)?;
             last = Some(v);

@@ -196,9 +196,12 @@ fn masked_crc(bytes: &[u8]) -> u32 {
 /// CRC-32C (Castagnoli), bit by bit: a few hundred bytes per log entry need no table.
 fn crc32c(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(!0u32, |crc, b| {
-        (0..8).fold(crc ^ u32::from(*b), |c, _| {
-            if c & 1 == 1 { (c >> 1) ^ 0x82f6_3b78 } else { c >> 1 }
-        })
+        (0..8).fold(
+            crc ^ u32::from(*b),
+            |c, _| {
+                if c & 1 == 1 { (c >> 1) ^ 0x82f6_3b78 } else { c >> 1 }
+            },
+        )
     })
 }
 

@@ -46,7 +46,8 @@ impl Pixels {
         let curve = |v: f32| 255.0 * (v / 255.0).powf(gamma);
         let mut histogram = [0u32; 256];
         self.data.iter().for_each(|v| histogram[usize::from(*v)] += 1);
-        let total: f32 = histogram.iter().enumerate().map(|(v, n)| curve(v as f32) * *n as f32).sum();
+        let total: f32 =
+            histogram.iter().enumerate().map(|(v, n)| curve(v as f32) * *n as f32).sum();
         let mean = total / self.data.len().max(1) as f32;
         let mut table = [0u8; 256];
         for (v, out) in table.iter_mut().enumerate() {
@@ -66,7 +67,8 @@ pub(super) fn degrade(
     rng: &mut impl Rng,
 ) {
     let (blur, sigma) = (rng.random_bool(config.blur_p), config.blur_sigma * rng.random::<f32>());
-    let (noise, level) = (rng.random_bool(config.noise_p), config.noise_sigma * rng.random::<f32>());
+    let (noise, level) =
+        (rng.random_bool(config.noise_p), config.noise_sigma * rng.random::<f32>());
     if blur && sigma > 0.1 {
         for plane in planes.chunks_exact_mut(side * side) {
             gaussian_blur(plane, side, sigma);

@@ -22,7 +22,7 @@ use augment::Pixels;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use tsda_runtime::{BBox, ModelSpec, Modality};
+use tsda_runtime::{BBox, Modality, ModelSpec};
 
 /// One crop, ready for the network.
 #[derive(Clone, Debug)]
@@ -131,8 +131,7 @@ impl Processor {
     ) -> Crop {
         let (config, side) = (&self.config, self.spec.crop_side());
         let picture = frame.picture.as_ref();
-        let bbox =
-            if joint.mirror { flip_box(&frame.bbox, picture.width) } else { frame.bbox };
+        let bbox = if joint.mirror { flip_box(&frame.bbox, picture.width) } else { frame.bbox };
         let around = jittered(&bbox, jitter, rng);
         let normal: f32 = StandardNormal.sample(rng);
         let rule = CropRule {

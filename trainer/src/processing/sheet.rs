@@ -17,7 +17,8 @@ pub fn contact_sheet(spec: &ModelSpec, samples: &[Sample]) -> RgbImage {
     for (row, sample) in samples.iter().enumerate() {
         let crops = sample.templates.iter().chain([&sample.search]);
         for (column, crop) in crops.enumerate() {
-            let colour = if column < sample.templates.len() { [80, 255, 80] } else { [255, 60, 60] };
+            let colour =
+                if column < sample.templates.len() { [80, 255, 80] } else { [255, 60, 60] };
             draw(&mut sheet, spec, crop, (GAP + column * cell, GAP + row * cell), Rgb(colour));
         }
     }
@@ -40,7 +41,8 @@ fn draw(
         for x in 0..side {
             let value = |c: usize| {
                 let v = crop.pixels[c * n + y * side + x];
-                ((v * spec.input_std[c] + spec.input_mean[c]) * 255.0).round().clamp(0.0, 255.0) as u8
+                ((v * spec.input_std[c] + spec.input_mean[c]) * 255.0).round().clamp(0.0, 255.0)
+                    as u8
             };
             put(x, y, Rgb([value(0), value(1), value(2)]));
         }

@@ -130,8 +130,9 @@ impl Sampler {
             if validation && name.is_empty() {
                 continue;
             }
-            let split: Split = name.parse().map_err(|e: UnknownSplit| {
-                SampleError::Split { path: source.path.clone(), reason: e.to_string() }
+            let split: Split = name.parse().map_err(|e: UnknownSplit| SampleError::Split {
+                path: source.path.clone(),
+                reason: e.to_string(),
             })?;
             let sequences: Vec<Box<dyn Sequence>> = match source.kind {
                 DataKind::Pairs => boxed(PairsDataset::open(&source.path, split)?.into_pairs()),
@@ -356,8 +357,13 @@ impl Source {
         }
         let with_targets: Vec<usize> =
             (0..usable.len()).filter(|&i| !usable[i].1.is_empty()).collect();
-        (!usable.is_empty() && (regions || !with_targets.is_empty()))
-            .then_some(Self { sequences, registered, weight, usable, with_targets })
+        (!usable.is_empty() && (regions || !with_targets.is_empty())).then_some(Self {
+            sequences,
+            registered,
+            weight,
+            usable,
+            with_targets,
+        })
     }
 }
 

@@ -20,7 +20,8 @@ fn gradient(picture: &Picture, region: (usize, usize, usize, usize)) -> f32 {
         let i = (y * picture.width + x) * picture.channels + channel;
         i32::from(picture.data.get(i).copied().unwrap_or(0))
     };
-    let step = (((x1 - x0) * (y1 - y0)) as f32 / 2000.0).sqrt().ceil().max(1.0) as usize;
+    // Odd, so that a regular pattern is not always met at the same phase.
+    let step = (((x1 - x0) * (y1 - y0)) as f32 / 2000.0).sqrt().ceil().max(1.0) as usize | 1;
     let (mut sum, mut n) = (0u32, 0u32);
     for y in (y0..y1).step_by(step) {
         for x in (x0..x1).step_by(step) {
