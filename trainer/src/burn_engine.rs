@@ -128,3 +128,58 @@ impl Engine for BurnEngine {
         Ok(Maps { scores: &self.scores, ltrb: &self.boxes })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::NetOptions;
+
+    fn engine() -> BurnEngine {
+        let spec = ModelSpec {
+            crop: 32,
+            width: 16,
+            feed_forward: 16,
+            encoder_layers: 1,
+            decoder_layers: 1,
+            ..ModelSpec::NANO
+        };
+        let device = Device::flex().autodiff();
+        device.seed(7);
+        BurnEngine::new(&TrackerNet::new(&spec, &NetOptions::default(), &device).unwrap())
+    }
+
+    #[test]
+    fn a_frame_runs_as_the_trait_says() {
+        let mut engine = engine();
+        engine.crop_mut().iter_mut().enumerate().for_each(|(i, v)| *v = (i % 7) as f32 - 3.0);
+        engine.features().unwrap();
+        let input = engine.template_input_mut();
+        input.label.fill(0.5);
+        input.ltrb.fill(0.1);
+        engine.write_template(0).unwrap();
+        let one = engine.predict(1).unwrap();
+        assert_eq!((one.scores.len(), one.ltrb.len()), (4, 16));
+        assert!(one.scores.iter().all(|v| v.is_finite()));
+        assert!(one.ltrb.iter().all(|v| *v > 0.0));
+        let (scores, ltrb) = (one.scores.to_vec(), one.ltrb.to_vec());
+
+        // A second template changes the scores, but never the boxes (spec 1.7).
+        engine.template_input_mut().label.fill(0.0);
+        engine.write_template(1).unwrap();
+        let two = engine.predict(2).unwrap();
+        assert_ne!(two.scores, scores);
+        assert_eq!(two.ltrb, ltrb);
+    }
+
+    #[test]
+    fn wrong_calls_are_errors() {
+        let mut engine = engine();
+        assert_eq!(engine.write_template(0).unwrap_err().stage, Stage::Template);
+        engine.features().unwrap();
+        assert_eq!(engine.write_template(2).unwrap_err().stage, Stage::Template);
+        for filled in [0, 1, 3] {
+            let error = engine.predict(filled).map(|_| ()).unwrap_err();
+            assert_eq!(error.stage, Stage::Predict, "{filled}");
+        }
+    }
+}

@@ -5,7 +5,7 @@ use crate::import::{self, StateDict, StateTensor};
 use crate::losses::{LossWeights, losses};
 use burn::module::{ModuleVisitor, Param};
 use burn::tensor::Gradients;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use tsda_runtime::Backbone;
 
 /// The small configuration of the golden vectors.
@@ -115,11 +115,15 @@ fn shared(name: &str) -> Option<StateDict> {
     Some(StateDict::read(&path).unwrap())
 }
 
-/// Compact copies of inputs and expected results, which live in the repository.
+/// A file of reference figures that lives in the repository.
+fn committed(name: &str) -> StateDict {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden/model");
+    StateDict::read(&folder.join(name)).unwrap()
+}
+
+/// Compact copies of the small network's inputs and expected results.
 fn compact() -> StateDict {
-    let path: PathBuf =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden/model/small.safetensors");
-    StateDict::read(&path).unwrap()
+    committed("small.safetensors")
 }
 
 fn tensor<const D: usize>(
@@ -176,6 +180,23 @@ fn tracking_mode_equals_the_reference() {
         let (s, l) = (difference(&scores, want("scores")), difference(&ltrb, want("ltrb")));
         println!("{case}: scores {s:.1e}, ltrb {l:.1e}");
         assert!(s <= 2e-5 && l <= 2e-5, "{case}: scores {s}, ltrb {l}");
+    }
+}
+
+#[test]
+fn efficientnet_equals_a_numpy_reference() {
+    let (spec, device) = (tiny(), Device::flex());
+    let net = recipe_net(&spec, &NO_DROPOUT, &device);
+    let image = TensorData::new(recipe_image(0, 64), [1, 3, 64, 64]);
+    let image = Tensor::<4>::from_data(image, &device);
+    let want = committed("efficientnet_lite0_64.safetensors");
+    let want = &want.get("feature").unwrap().values;
+    let peak = want.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    let plain = net.feature_extractor.forward(image.clone(), net.frozen);
+    let wide = net.feature_extractor.forward_wide(image, net.frozen).swap_dims(0, 1);
+    for (road, map) in [("plain", plain), ("wide", wide)] {
+        let off = difference(&values(map), want);
+        assert!(off <= 1e-5 * peak, "{road}: off by {off} of {peak}");
     }
 }
 
