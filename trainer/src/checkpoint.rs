@@ -339,7 +339,8 @@ mod tests {
 
     #[test]
     fn damage_of_any_kind_falls_back_to_the_one_before() {
-        let damages: [(&str, fn(&Path)); 6] = [
+        type Damage = (&'static str, fn(&Path));
+        let damages: [Damage; 6] = [
             ("truncated", |p| fs::write(p.join("model"), [1, 2]).unwrap()),
             ("altered", |p| fs::write(p.join("model"), 99u64.to_le_bytes()).unwrap()),
             ("missing file", |p| fs::remove_file(p.join("optim")).unwrap()),

@@ -275,7 +275,11 @@ fn bad_input_is_refused_in_one_line_and_leaves_nothing_behind() {
     }
     let output = bench.fit("c.toml", "o", &[]);
     assert_eq!(output.status.code(), Some(2));
-    assert!(text(&output).contains("visible/") && text(&output).contains("decode"), "{}", text(&output));
+    assert!(
+        text(&output).contains("visible/") && text(&output).contains("decode"),
+        "{}",
+        text(&output)
+    );
 }
 
 #[test]
