@@ -5,6 +5,7 @@ use super::layers::uniform;
 use burn::module::Param;
 use burn::nn::{Dropout, DropoutConfig, LayerNorm, LayerNormConfig, Linear, LinearConfig};
 use burn::prelude::*;
+use burn::tensor::Distribution;
 use burn::tensor::activation::{relu, softmax};
 use burn::tensor::module::linear;
 
@@ -246,8 +247,20 @@ pub(crate) struct Transformer {
 }
 
 impl Transformer {
-    /// Xavier-uniform matrices, zero attention biases (spec 1.9).
+    /// Xavier-uniform matrices, zero attention biases (spec 1.9), but for one: the decoder starts from
+    /// a zero token, so the first thing it normalises is the bias of its first attention. At zero,
+    /// that norm multiplies gradients by 1/sqrt(eps) = 316 and every early step throws the query
+    /// into a new direction; a bias of unit size starts it somewhere and keeps it there.
     pub fn new(shape: &Shape, encoder: usize, decoder: usize, device: &Device) -> Self {
+        let mut net = Self::by_specification(shape, encoder, decoder, device);
+        if let Some(first) = net.decoder.layers.first_mut() {
+            let start = Tensor::random([shape.width], Distribution::Normal(0.0, 1.0), device);
+            first.self_attn.out_proj.bias = Some(Param::from_tensor(start));
+        }
+        net
+    }
+
+    fn by_specification(shape: &Shape, encoder: usize, decoder: usize, device: &Device) -> Self {
         Self {
             encoder: Encoder {
                 layers: (0..encoder).map(|_| EncoderLayer::new(shape, device)).collect(),
