@@ -66,7 +66,9 @@ fn tract_equals_burn_and_weights_are_stored_once() {
         let file = Bundle::parse(&bytes).unwrap();
         let report = check(&file).unwrap();
         println!("{name}: {} parameters, bundle of {} bytes\n{report}", parameters, bytes.len());
-        assert_eq!(report.differences.len(), 2 * usize::from(spec.templates));
+        // Every engine compiled in, two maps for every number of templates.
+        let engines = if cfg!(feature = "ort") { 2 } else { 1 };
+        assert_eq!(report.differences.len(), engines * 2 * usize::from(spec.templates));
         assert!(report.max() <= TOLERANCE, "{name}: differs by {}", report.max());
         // Each parameter once, though three or four graphs use them; beside them the positional
         // codes of every predict graph, folded constants, the graphs themselves and the probe.
@@ -368,4 +370,18 @@ fn empty() -> Manifest<'static> {
         card: "",
         sections: Default::default(),
     }
+}
+
+/// A missing library is an error, not a panic.
+#[cfg(feature = "ort")]
+#[test]
+fn a_missing_onnx_runtime_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("x.tsda");
+    std::fs::write(&path, random_bundle("any", &small_resnet()).0).unwrap();
+    let absent = dir.path().join("libabsent.so");
+    let out = tool().arg("check").arg(&path).env("TSDA_ORT_LIB", &absent).output().unwrap();
+    let text = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert_eq!(out.status.code(), Some(2), "{text}");
+    assert!(text.contains("libabsent.so") && text.contains("TSDA_ORT_LIB"), "{text}");
 }

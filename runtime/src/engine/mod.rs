@@ -9,6 +9,8 @@
 //!    [`Engine::write_template`]: the head feature of the last `features` call becomes the tokens of
 //!    that slot.
 
+#[cfg(feature = "ort")]
+pub mod ort;
 #[cfg(feature = "tract")]
 pub mod tract;
 
