@@ -52,3 +52,18 @@ pub fn engine(file: &BundleFile, bundle: &Bundle<'_>) -> Result<TractEngine, Hos
         source: Box::new(source),
     })
 }
+
+/// ONNX Runtime, from the shared library found at run time.
+///
+/// # Errors
+/// When there is no library, or it refuses the bundle's graphs.
+#[cfg(feature = "ort")]
+pub fn ort_engine(
+    file: &BundleFile,
+    bundle: &Bundle<'_>,
+) -> Result<tsda_runtime::engine::ort::OrtEngine, HostError> {
+    tsda_runtime::engine::ort::OrtEngine::from_bundle(bundle).map_err(|source| HostError::Engine {
+        bundle: file.path().to_path_buf(),
+        source: Box::new(source),
+    })
+}

@@ -80,10 +80,14 @@ impl Run<'_> {
     ) -> Result<Vec<Step>, HostError> {
         let mut steps: Vec<Step> = Vec::new();
         let mut size = None;
-        while let Some(frame) = source.next_frame()? {
-            if self.stop.load(Ordering::Relaxed) {
+        let stopped = || self.stop.load(Ordering::Relaxed);
+        loop {
+            // Ctrl-C reaches the program that feeds the pipe too, so a stream often breaks then.
+            let next_frame = source.next_frame();
+            if stopped() {
                 return Err(HostError::Interrupted);
             }
+            let Some(frame) = next_frame? else { break };
             let step = match steps.last() {
                 None => self.first(tracker, &frame)?,
                 Some(before) => next(tracker, &frame, before.bbox, size)?,
@@ -101,9 +105,6 @@ impl Run<'_> {
                 what: "frames".into(),
                 reason: "the source ended before its first frame".into(),
             });
-        }
-        if self.stop.load(Ordering::Relaxed) {
-            return Err(HostError::Interrupted);
         }
         for sink in sinks {
             sink.finish()?;

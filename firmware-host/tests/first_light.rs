@@ -131,3 +131,55 @@ fn a_list_of_two_sensors_is_tracked() {
     let told = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(told.contains("mean IoU") && told.contains("thermal"), "{told}");
 }
+
+/// Ctrl-C in the middle of a stream: code 3, one line, and nothing left in the folder.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_run_leaves_nothing() {
+    use std::io::{Read as _, Write as _};
+    use std::process::Stdio;
+    if !embedded() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("temp");
+    let args = [
+        "track",
+        "--frames",
+        "-",
+        "--init",
+        "9,9,20,20",
+        "--out",
+        "b.txt",
+        "--json",
+        "-",
+        "--video-out",
+        "v.gif",
+        "--video-out",
+        "png",
+    ];
+    let mut child = Command::new(env!("CARGO_BIN_EXE_tsda"))
+        .args(args)
+        .current_dir(dir.path())
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    let mut stdin = child.stdin.take().expect("pipe");
+    let mut stream = b"YUV4MPEG2 W64 H48 Cmono\nFRAME\n".to_vec();
+    stream.extend((0..64 * 48).map(|i| (i * 7) as u8));
+    stdin.write_all(&stream).expect("first frame");
+    // A line on standard output says that the first frame is done and the outputs are open.
+    let mut byte = [0];
+    child.stdout.take().expect("pipe").read_exact(&mut byte).expect("first row");
+    assert!(fs::read_dir(dir.path()).expect("folder").count() >= 3, "outputs in the making");
+    let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+    assert!(killed.expect("kill").success());
+    std::thread::sleep(std::time::Duration::from_millis(200));
+    drop(stdin);
+    let output = child.wait_with_output().expect("the program ends");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{message}");
+    assert!(message.contains("interrupted"), "{message}");
+    assert_eq!(fs::read_dir(dir.path()).expect("folder").count(), 0);
+}

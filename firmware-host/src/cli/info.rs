@@ -54,7 +54,7 @@ fn describe(path: &str, bundle: &Bundle<'_>) -> String {
         row(
             "weights",
             format!(
-                "{} bytes, about {} numbers of 32 bits",
+                "{} bytes, {} numbers of 32 bits (norms folded in)",
                 grouped(weights.len() as u64),
                 grouped(weights.len() as u64 / 4)
             ),
