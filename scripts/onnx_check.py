@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Checks an unpacked bundle with the onnx package and ONNX Runtime.
 
-    tsda-export unpack models/nano.tsda /tmp/nano
-    python3 scripts/onnx_check.py /tmp/nano [--tolerance 1e-4]
+    tsda-export unpack models/nano.tsda nano-onnx
+    python3 scripts/onnx_check.py nano-onnx [--tolerance 1e-4]
 
 Runs onnx.checker (full check, shape inference included) on every graph, then drives the probe
 through ONNX Runtime and compares its maps with those of the trainer's own network (probe.bin).

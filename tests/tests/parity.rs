@@ -1,0 +1,80 @@
+//! Trainer, export and engine compute the same numbers, frame after frame.
+
+use tsda_export::{bundle, network};
+use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, Provenance, SectionKind, TrainedOn};
+use tsda_runtime::engine::tract::TractEngine;
+use tsda_runtime::probe::{self, Probe};
+use tsda_runtime::{BBox, FrameView, ModelSpec, Tracker, TrackerParams};
+use tsda_trainer::burn_engine::BurnEngine;
+
+/// Largest difference allowed between burn and tract on score map and ltrb.
+const TOLERANCE: f32 = 1e-4;
+
+#[test]
+fn the_shipped_bundle_repeats_the_trainers_numbers() {
+    let file = BundleFile::open(tsda_tests::shipped_bundle()).unwrap();
+    let bundle = file.bundle().unwrap();
+    let spec = bundle.manifest().spec;
+    let probe = Probe::parse(bundle.require(SectionKind::Probe).unwrap(), &spec).unwrap();
+    let mut engine = TractEngine::from_bundle(&bundle).unwrap();
+    let report = probe::run(&mut engine, &probe).unwrap();
+    println!("nano.tsda, tract against burn, probe: {:e}", report.max());
+    assert!(report.max() <= TOLERANCE, "{report:?}");
+}
+
+/// The recipe picture, seen through a window that moves by 3 pixels per frame.
+fn picture(wide: &[u8], t: usize) -> Vec<u8> {
+    let row = |y: usize| (y * WIDE + 3 * t) * 3;
+    (0..HEIGHT).flat_map(|y| wide[row(y)..row(y) + WIDTH * 3].iter().copied()).collect()
+}
+
+const WIDE: usize = 360;
+const WIDTH: usize = 320;
+const HEIGHT: usize = 240;
+
+#[test]
+fn burn_and_tract_drive_the_tracker_alike() {
+    let spec = ModelSpec::NANO;
+    // Random weights: nothing in this test depends on what ships.
+    let net = network::untrained(&spec, 3).unwrap();
+    // Every frame counts as found and is learnt, so that both slots and all graphs are used.
+    let tracker =
+        TrackerParams { not_found: 0.0, write_confidence: 0.0, ..TrackerParams::default() };
+    let manifest = Manifest {
+        name: "random",
+        spec,
+        tracker,
+        trained_on: TrainedOn::default(),
+        calibration: None,
+        provenance: Provenance::default(),
+        figures: Default::default(),
+        licence: "none",
+        card: "",
+        sections: Default::default(),
+    };
+    let bytes =
+        bundle::encode(&manifest, &network::files(&network::graphs(&net).unwrap())).unwrap();
+    let tract = TractEngine::from_bundle(&Bundle::parse(&bytes).unwrap()).unwrap();
+
+    let mut wide = vec![0; WIDE * HEIGHT * 3];
+    probe::recipe_image(7, WIDE, HEIGHT, &mut wide);
+    let mut a = Tracker::new(BurnEngine::new(&net), tracker).unwrap();
+    let mut b = Tracker::new(tract, tracker).unwrap();
+    let mut worst = 0f32;
+    for t in 0..8 {
+        let data = picture(&wide, t);
+        let view = FrameView::rgb(&data, WIDTH, HEIGHT).unwrap();
+        if t == 0 {
+            let target = BBox::new(120.0, 90.0, 50.0, 40.0);
+            a.init(&view, target, None).unwrap();
+            b.init(&view, target, None).unwrap();
+            continue;
+        }
+        let (ta, tb) = (a.update(&view, None).unwrap(), b.update(&view, None).unwrap());
+        worst = worst.max((ta.score - tb.score).abs());
+        assert!((ta.score - tb.score).abs() < TOLERANCE, "frame {t}: {ta:?} {tb:?}");
+        assert!(ta.bbox.iou(&tb.bbox) > 0.999, "frame {t}: {ta:?} {tb:?}");
+        assert_eq!((ta.flag, ta.wrote_memory), (tb.flag, tb.wrote_memory), "frame {t}");
+    }
+    println!("burn against tract through the tracker: scores differ by at most {worst:e}");
+}
