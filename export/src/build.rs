@@ -111,8 +111,8 @@ pub struct BuildReport {
 /// Names the file, field or tensor that cannot be used. No file is left behind then.
 pub fn build(options: &BuildOptions) -> Result<BuildReport, BuildError> {
     let text = files::read_text(&options.config)?;
-    // Parsed, not loaded: paths stay as written, so that none of this machine gets into the bundle.
-    let experiment = Experiment::parse(&text, &options.config)?;
+    // Parsed, not loaded, which would look for the data sources on this machine.
+    let experiment = portable(Experiment::parse(&text, &options.config)?);
     let spec = experiment
         .model_spec()
         .map_err(|source| BuildError::Spec { path: options.config.clone(), source })?;
@@ -170,6 +170,22 @@ pub fn build(options: &BuildOptions) -> Result<BuildReport, BuildError> {
         weights,
         bundle,
     })
+}
+
+/// Absolute paths cut to their last part: a bundle tells nothing about the machine it was made on.
+fn portable(mut experiment: Experiment) -> Experiment {
+    let cut = |path: &Path| match path.file_name() {
+        Some(name) if path.is_absolute() => PathBuf::from(name),
+        _ => path.to_owned(),
+    };
+    experiment.run.out = cut(&experiment.run.out);
+    for source in &mut experiment.data {
+        source.path = cut(&source.path);
+    }
+    for path in [&mut experiment.init.backbone, &mut experiment.init.weights] {
+        *path = cut(Path::new(path.as_str())).to_string_lossy().into_owned();
+    }
+    experiment
 }
 
 fn stem(path: &Path) -> String {

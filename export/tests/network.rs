@@ -128,7 +128,7 @@ templates = 3
 
 [[data]]
 kind = "pairs"
-path = "pairs"
+path = "/somewhere/private/pairs"
 
 [sampler]
 cross_modal_p = 0.5
@@ -159,6 +159,9 @@ fn built_checked_and_unpacked() {
     assert_eq!((manifest.figures[0].name, manifest.figures[0].value), ("SR0.5 val", 0.75));
     assert_eq!((manifest.card, manifest.licence), ("# Small\n", "CC0-1.0"));
     assert!(manifest.trained_on.cross_modal);
+    // Paths of this machine stay here.
+    assert!(manifest.provenance.config.contains("path = \"pairs\""));
+    assert!(!manifest.provenance.config.contains("private"));
 
     let out = tool().arg("check").arg(&options.out).output().unwrap();
     println!("{}", String::from_utf8_lossy(&out.stdout));
