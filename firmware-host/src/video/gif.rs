@@ -74,9 +74,9 @@ impl Sink for GifVideo {
             let (to, from) = (y * *width * 3, y * picture.width * 3);
             pixels[to..to + row].copy_from_slice(&picture.data[from..from + row]);
         }
-        // Dropping the lowest bits hides sensor noise from the compressor: a third of the bytes.
+        // Dropping the lowest bits hides sensor noise from the compressor.
         for v in &mut pixels {
-            *v = (*v & 0xF0) | (*v >> 4);
+            *v = (*v & 0xF8) | (*v >> 5);
         }
         let mut frame = gif::Frame::from_rgb_speed(side(*width)?, side(*height)?, &pixels, 20);
         frame.delay = DELAY;
