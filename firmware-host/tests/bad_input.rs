@@ -147,19 +147,8 @@ fn arguments_that_make_no_sense() {
 mod with_model {
     use super::*;
 
-    fn embedded() -> bool {
-        let there = tsda_host::model::embedded().is_some();
-        if !there {
-            eprintln!("skipped: this build has no embedded model");
-        }
-        there
-    }
-
     #[test]
     fn boxes_outside_the_picture_or_without_area() {
-        if !embedded() {
-            return;
-        }
         let dir = workplace();
         for (init, words) in [
             ("200,10,20,20", &["--init 200,10,20,20", "outside", "64 x 48"][..]),
@@ -192,9 +181,6 @@ mod with_model {
 
     #[test]
     fn pictures_that_are_cut_or_empty() {
-        if !embedded() {
-            return;
-        }
         let dir = workplace();
         let run = |frames, stdin: &[u8], words: &[&str]| {
             let args = ["track", "--frames", frames, "--init", "9,9,20,20", "--out", "boxes.txt"];
@@ -211,9 +197,6 @@ mod with_model {
 
     #[test]
     fn outputs_that_cannot_be_written() {
-        if !embedded() {
-            return;
-        }
         let dir = workplace();
         for (out, more) in [
             ("no/such/folder/b.txt", &[][..]),

@@ -1,4 +1,4 @@
-//! The program with the model that ships in the repository. Without one, the tests say so and pass.
+//! The program with the model that ships in the repository and is built into it.
 
 use std::fs;
 use std::path::Path;
@@ -12,31 +12,10 @@ fn tsda(dir: &Path, args: &[&str]) -> Output {
         .expect("the program starts")
 }
 
-fn embedded() -> bool {
-    let there = tsda_host::model::embedded().is_some();
-    if !there {
-        eprintln!("skipped: this build has no embedded model");
-    }
-    there
-}
-
 fn ok(output: &Output) -> String {
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
     text
-}
-
-#[test]
-fn without_a_model_the_program_asks_for_one() {
-    if tsda_host::model::embedded().is_some() {
-        return;
-    }
-    let dir = tempfile::tempdir().expect("temp");
-    let output = tsda(dir.path(), &["demo"]);
-    assert_eq!(output.status.code(), Some(2));
-    let message = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(message.contains("pass --bundle"), "{message}");
-    assert!(!dir.path().join("tsda-demo").exists());
 }
 
 /// Reads `all   0-95   95   0.9 ...` from the demo's table.
@@ -47,9 +26,6 @@ fn figure(text: &str, row: &str, column: usize) -> f32 {
 
 #[test]
 fn the_demo_follows_the_target_through_the_switch() {
-    if !embedded() {
-        return;
-    }
     let dir = tempfile::tempdir().expect("temp");
     let text = ok(&tsda(dir.path(), &["demo", "--out", "r"]));
     println!("{text}");
@@ -65,9 +41,6 @@ fn the_demo_follows_the_target_through_the_switch() {
 
 #[test]
 fn the_shipped_model_passes_its_own_check() {
-    if !embedded() {
-        return;
-    }
     let dir = tempfile::tempdir().expect("temp");
     let text = ok(&tsda(dir.path(), &["verify"]));
     println!("{text}");
@@ -86,9 +59,6 @@ fn a_list_of_two_sensors_is_tracked() {
     use tsda_host::picture::Picture;
     use tsda_host::render::{Clip, ClipConfig};
     use tsda_runtime::Modality;
-    if !embedded() {
-        return;
-    }
     let dir = tempfile::tempdir().expect("temp");
     let clip = Clip::new(ClipConfig::default());
     let (mut list, mut truth) = (String::new(), String::new());
@@ -138,9 +108,6 @@ fn a_list_of_two_sensors_is_tracked() {
 fn an_interrupted_run_leaves_nothing() {
     use std::io::{Read as _, Write as _};
     use std::process::Stdio;
-    if !embedded() {
-        return;
-    }
     let dir = tempfile::tempdir().expect("temp");
     let args = [
         "track",
