@@ -26,4 +26,13 @@ if prepare_python; then
   export TSDA_PYTHON
 fi
 
-exec cargo test --workspace --locked "$@"
+log="$target/test.log"
+mkdir -p "$target"
+status=0
+# --show-output: the measured figures (parity, allocations, reference cases) are worth reading.
+cargo test --workspace --locked "$@" -- --show-output 2>&1 | tee "$log" || status=$?
+
+# cargo closes with the documentation tests of the last crate; this is the sum over all of them.
+awk '/^test result:/ { passed += $4; failed += $6; ignored += $8 }
+     END { printf "%d passed, %d failed, %d skipped\n", passed, failed, ignored }' "$log"
+exit "$status"
