@@ -2,7 +2,9 @@
 //! regressor (spec 1.3 to 1.8).
 
 use super::kernels;
-use super::layers::{Conv, Geometry, instance_l2_norm, instance_l2_norm_wide, positional_code};
+use super::layers::{
+    Conv, Geometry, filled, instance_l2_norm, instance_l2_norm_wide, positional_code, uniform,
+};
 use super::transformer::{Shape, Transformer, linear_layer};
 use burn::module::{Param, RunningState};
 use burn::nn::{BatchNorm, BatchNormConfig, GroupNorm, GroupNormConfig, Linear};
@@ -141,9 +143,8 @@ const TOWER: usize = 4;
 fn quiet_linear(d: usize, device: &Device) -> Linear {
     let bound = 0.05 / (d as f64).sqrt();
     let mut linear = linear_layer(d, d, device);
-    linear.weight =
-        Param::from_tensor(Tensor::random([d, d], Distribution::Uniform(-bound, bound), device));
-    linear.bias = Some(Param::from_tensor(Tensor::zeros([d], device)));
+    linear.weight = uniform([d, d], bound, device);
+    linear.bias = Some(filled([d], 0.0, device));
     linear
 }
 
@@ -187,7 +188,7 @@ impl Head {
                     })
                     .collect(),
                 bbreg_layer: Conv {
-                    bias: Some(Param::from_tensor(Tensor::full([4], half_target, device))),
+                    bias: Some(filled([4], half_target, device)),
                     ..conv(d, 4, true)
                 },
             },

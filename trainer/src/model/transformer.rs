@@ -1,7 +1,7 @@
 //! Encoder and decoder of the filter predictor (spec 1.6), written so that training and the
 //! exported graphs share every line: exact re-arrangements of spec 4.3, dropout where it belongs.
 
-use super::layers::uniform;
+use super::layers::{filled, uniform};
 use burn::module::Param;
 use burn::nn::{Dropout, DropoutConfig, LayerNorm, LayerNormConfig, Linear, LinearConfig};
 use burn::prelude::*;
@@ -57,10 +57,10 @@ impl Attention {
     fn new(shape: &Shape, device: &Device) -> Self {
         let d = shape.width;
         let mut out_proj = xavier_linear(d, d, device);
-        out_proj.bias = Some(super::layers::filled([d], 0.0, device));
+        out_proj.bias = Some(filled([d], 0.0, device));
         Self {
             in_proj_weight: uniform([3 * d, d], (6.0 / (4 * d) as f64).sqrt(), device),
-            in_proj_bias: super::layers::filled([3 * d], 0.0, device),
+            in_proj_bias: filled([3 * d], 0.0, device),
             out_proj,
             dropout: DropoutConfig::new(shape.attention_dropout).init(),
             heads: shape.heads,
