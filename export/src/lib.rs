@@ -4,7 +4,8 @@
 //! 2. [`network`] records the tracker's three inference functions with it.
 //! 3. [`build`] reads weights and configuration, adds reference outputs and writes the bundle
 //!    ([`bundle`]).
-//! 4. [`check`] compares every engine with the reference outputs; [`unpack`] takes a bundle apart.
+//! 4. [`check`] compares every engine with the reference outputs; [`unpack`] takes a bundle apart;
+//!    [`macs`] counts what it computes.
 //!
 //! The command line is `tsda-export` (`src/main.rs`).
 
@@ -12,6 +13,7 @@ pub mod build;
 pub mod bundle;
 pub mod check;
 pub mod files;
+pub mod macs;
 pub mod network;
 pub mod onnx;
 pub mod unpack;

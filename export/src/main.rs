@@ -1,4 +1,4 @@
-//! `tsda-export`: build, check and unpack bundles.
+//! `tsda-export`: build, check, unpack bundles, and count what they compute.
 //!
 //! Exit codes: 0 done; 1 an engine differs by more than the tolerance; 2 bad input.
 
@@ -8,7 +8,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use tsda_export::build::{BuildOptions, build};
 use tsda_export::check::check;
+use tsda_export::macs::{self, MacsReport};
+use tsda_export::network;
 use tsda_export::unpack::unpack;
+use tsda_runtime::ModelSpec;
 use tsda_runtime::bundle::BundleFile;
 
 /// Turns trained weights into bundles that run on a board, and checks them.
@@ -63,6 +66,25 @@ enum Command {
         /// The folder to write to; made if it is not there.
         dir: PathBuf,
     },
+    /// Counts multiply-accumulates by graph and part of the network, and per frame.
+    Macs {
+        #[command(flatten)]
+        of: Counted,
+        /// Prints JSON.
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+/// What `tsda-export macs` counts.
+#[derive(clap::Args)]
+#[group(required = true, multiple = false)]
+struct Counted {
+    /// The bundle.
+    bundle: Option<PathBuf>,
+    /// A preset instead of a bundle: nano, tomp50, tomp101.
+    #[arg(long)]
+    preset: Option<String>,
 }
 
 fn tolerance(text: &str) -> Result<f32, String> {
@@ -121,5 +143,26 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
             }
             Ok(ExitCode::SUCCESS)
         }
+        Command::Macs { of, json } => {
+            let report = count(&of)?;
+            if json {
+                println!("{}", serde_json::to_string_pretty(&report)?);
+            } else {
+                print!("{report}");
+            }
+            Ok(ExitCode::SUCCESS)
+        }
     }
+}
+
+fn count(of: &Counted) -> anyhow::Result<MacsReport> {
+    if let Some(path) = &of.bundle {
+        let file = BundleFile::open(path)?;
+        return macs::of_bundle(&file.bundle()?).with_context(|| format!("{}", path.display()));
+    }
+    let name = of.preset.as_deref().unwrap_or_default();
+    let spec = ModelSpec::preset(name)
+        .with_context(|| format!("preset `{name}` is not known; nano, tomp50 and tomp101 are"))?;
+    // Weights do not matter: shapes are all that is counted.
+    Ok(macs::of_graphs(&network::graphs(&network::untrained(&spec, 0)?)?))
 }

@@ -5,7 +5,7 @@ use burn::module::Module as _;
 use burn::tensor::Device;
 use tsda_runtime::ModelSpec;
 use tsda_runtime::bundle::{SectionKind, WEIGHTS_FILE};
-use tsda_trainer::model::TrackerNet;
+use tsda_trainer::model::{SlotForm, TrackerNet};
 
 /// One graph and how it came about.
 #[derive(Clone, Debug)]
@@ -25,10 +25,18 @@ pub struct NetworkGraph {
 /// # Errors
 /// When the network uses an operation that the converter does not know.
 pub fn graphs(net: &TrackerNet) -> Result<Vec<NetworkGraph>, ExportError> {
+    graphs_as(net, SlotForm::preferred(net.spec()))
+}
+
+/// [`graphs`] with a form of slot of choice.
+///
+/// # Errors
+/// As [`graphs`].
+pub fn graphs_as(net: &TrackerNet, form: SlotForm) -> Result<Vec<NetworkGraph>, ExportError> {
     let spec = *net.spec();
-    let mut graphs = vec![features(net, &spec)?, template(net, &spec)?];
+    let mut graphs = vec![features(net, &spec)?, template(net, &spec, form)?];
     for count in 1..=spec.templates {
-        graphs.push(predict(net, &spec, count)?);
+        graphs.push(predict(net, &spec, form, count)?);
     }
     Ok(graphs)
 }
@@ -72,9 +80,25 @@ fn features(net: &TrackerNet, spec: &ModelSpec) -> Result<NetworkGraph, ExportEr
     Ok(simplified(SectionKind::FeaturesOnnx, graph))
 }
 
-fn template(net: &TrackerNet, spec: &ModelSpec) -> Result<NetworkGraph, ExportError> {
+fn slot_doc(spec: &ModelSpec, form: SlotForm) -> String {
+    let (cells, d, columns) = (spec.cells(), spec.width, form.columns(spec));
+    let columns_are = match form {
+        SlotForm::Tokens => "channel of the token".into(),
+        SlotForm::Projected => format!(
+            "{d} each of token, query, key and value of the first encoder layer, positional code \
+             and biases included, queries divided by the root of a head's depth"
+        ),
+    };
+    format!("({cells}, {columns}): cell (row-major), {columns_are}")
+}
+
+fn template(
+    net: &TrackerNet,
+    spec: &ModelSpec,
+    form: SlotForm,
+) -> Result<NetworkGraph, ExportError> {
     let (d, f) = (usize::from(spec.width), spec.map_side());
-    let doc = "Tokens of a frame to remember; run once per memory write.";
+    let doc = "What a slot keeps of a frame to remember; run once per memory write.";
     let graph = record("template", doc, |r| {
         let net = r.module(net);
         let feature = r.input("feature", [1, d, f, f], &feature_doc(spec))?;
@@ -88,13 +112,18 @@ fn template(net: &TrackerNet, spec: &ModelSpec) -> Result<NetworkGraph, ExportEr
              8) to its left, top, right, bottom edge, in units of the crop side"
         );
         let ltrb = r.input("ltrb", [4, f, f], &ltrb)?;
-        let tokens = format!("template tokens ({}, {d}): cell (row-major), channel", f * f);
-        r.output("tokens", net.template(feature, label, ltrb), &tokens)
+        let doc = format!("template slot {}", slot_doc(spec, form));
+        r.output("tokens", net.template_as(form, feature, label, ltrb), &doc)
     })?;
     Ok(simplified(SectionKind::TemplateOnnx, graph))
 }
 
-fn predict(net: &TrackerNet, spec: &ModelSpec, count: u8) -> Result<NetworkGraph, ExportError> {
+fn predict(
+    net: &TrackerNet,
+    spec: &ModelSpec,
+    form: SlotForm,
+    count: u8,
+) -> Result<NetworkGraph, ExportError> {
     let (d, f) = (usize::from(spec.width), spec.map_side());
     let doc = format!("Score map and boxes of a search frame against {count} template(s).");
     let graph = record(&format!("predict{count}"), &doc, |r| {
@@ -102,8 +131,8 @@ fn predict(net: &TrackerNet, spec: &ModelSpec, count: u8) -> Result<NetworkGraph
         let templates = (0..count)
             .map(|slot| {
                 let which = if slot == 0 { " of the annotated first frame" } else { "" };
-                let doc = format!("tokens ({}, {d}) of slot {slot}{which}", f * f);
-                r.input(&format!("template{slot}"), [f * f, d], &doc)
+                let doc = format!("slot {slot}{which}, as the template graph wrote it");
+                r.input(&format!("template{slot}"), [f * f, form.columns(spec)], &doc)
             })
             .collect::<Result<Vec<_>, _>>()?;
         let feature = r.input("feature", [1, d, f, f], &feature_doc(spec))?;

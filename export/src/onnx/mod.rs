@@ -10,6 +10,8 @@
 //! 3. [`encode`] writes the file, its weights inside or in a [`WeightStore`] shared by any number
 //!    of graphs.
 //!
+//! [`macs`] counts the multiply-accumulates of graphs and of model files.
+//!
 //! Modules are recorded in their inference form ([`burn::module::Module::valid`]), wherever they are.
 
 mod convert;
@@ -17,6 +19,7 @@ mod emit;
 mod error;
 mod eval;
 mod graph;
+pub mod macs;
 mod passes;
 pub mod proto;
 mod record;

@@ -40,7 +40,8 @@ pub trait Engine {
     /// Inputs of the `template` graph besides the head feature.
     fn template_input_mut(&mut self) -> TemplateInput<'_>;
 
-    /// Runs `template` on the current head feature and keeps the tokens `(F*F, d)` in `slot`.
+    /// Runs `template` on the current head feature and keeps the result in `slot`: template tokens
+    /// `(F*F, d)`, or with their first projections beside them `(F*F, 4d)`.
     ///
     /// # Errors
     /// When `slot` is not below `spec().templates`, or what the engine library reported.
@@ -52,6 +53,32 @@ pub trait Engine {
     /// When `filled` is 0, above `spec().templates` or a slot was never written, or what the engine
     /// library reported.
     fn predict(&mut self, filled: usize) -> Result<Maps<'_>, EngineError>;
+}
+
+/// Shape of a template slot, as the `template` graph declares its output `tokens`: one row per cell
+/// and one or several blocks of the network's width. What the blocks are is the graphs' own affair.
+#[cfg(any(feature = "tract", feature = "ort"))]
+fn slot_shape(
+    engine: &'static str,
+    spec: &ModelSpec,
+    declared: Option<&[i64]>,
+) -> Result<[usize; 2], EngineError> {
+    const MOST_BLOCKS: usize = 16;
+    let (cells, width) = (spec.cells(), usize::from(spec.width));
+    if let Some(&[rows, columns]) = declared
+        && let (Ok(rows), Ok(columns)) = (usize::try_from(rows), usize::try_from(columns))
+        && rows == cells
+        && columns.is_multiple_of(width)
+        && (1..=MOST_BLOCKS).contains(&(columns / width))
+    {
+        return Ok([rows, columns]);
+    }
+    let detail = format_args!(
+        "{}: output `tokens` must be f32 [{cells}, n * {width}] with n from 1 to {MOST_BLOCKS}, \
+         found {declared:?}",
+        crate::bundle::SectionKind::TemplateOnnx
+    );
+    Err(EngineError::new(engine, Stage::Load, detail))
 }
 
 /// Where a template's label and box go before [`Engine::write_template`].

@@ -6,7 +6,7 @@
 
 mod inline;
 
-use super::{Engine, EngineError, Maps, Stage, TemplateInput};
+use super::{Engine, EngineError, Maps, Stage, TemplateInput, slot_shape};
 use crate::bundle::{Bundle, SectionKind, WEIGHTS_FILE};
 use crate::spec::ModelSpec;
 use ::ort::environment::Environment;
@@ -67,7 +67,6 @@ impl OrtEngine {
     pub fn with_threads(bundle: &Bundle<'_>, threads: usize) -> Result<Self, EngineError> {
         let spec = bundle.manifest().spec;
         let (side, map, width) = (spec.crop_side(), spec.map_side(), usize::from(spec.width));
-        let cells = spec.cells();
         let environment = environment()?;
         let open = |kind| open(environment, bundle, kind, threads);
 
@@ -83,12 +82,18 @@ impl OrtEngine {
         let features = Graph { session: features, binding };
 
         let template = open(SectionKind::TemplateOnnx)?;
+        let declared = template.outputs().iter().find(|o| o.name() == "tokens").map(Outlet::dtype);
+        let declared = match declared {
+            Some(ValueType::Tensor { shape, .. }) => Some(&shape[..]),
+            _ => None,
+        };
+        let slot_shape = slot_shape(NAME, &spec, declared)?;
         let mut label = zeros(&[map, map])?;
         let mut ltrb = zeros(&[4, map, map])?;
         let mut tokens = Vec::new();
         let mut template_bindings = Vec::new();
         for _ in 0..spec.templates {
-            let mut slot = zeros(&[cells, width])?;
+            let mut slot = zeros(&slot_shape)?;
             template_bindings.push(bind(
                 SectionKind::TemplateOnnx,
                 &template,

@@ -3,7 +3,7 @@
 //! The graphs of a bundle keep their weights outside, as ONNX external data pointing into the
 //! weights section. They are put back in before tract reads a graph, so nothing is written to disk.
 
-use super::{Engine, EngineError, Maps, Stage, TemplateInput};
+use super::{Engine, EngineError, Maps, Stage, TemplateInput, slot_shape};
 use crate::bundle::{Bundle, SectionKind, WEIGHTS_FILE};
 use crate::spec::ModelSpec;
 use tract_onnx::pb::{self, tensor_proto, tensor_shape_proto::dimension, type_proto};
@@ -47,7 +47,8 @@ impl TractEngine {
         let label = port("label", &[map, map]);
         let ltrb = port("ltrb", &[4, map, map]);
         let scores = port("scores", &[map, map]);
-        let tokens = port("tokens", &[cells, width]);
+        let slot = slot_shape(NAME, &spec, declared_slot(bundle)?.as_deref())?;
+        let tokens = port("tokens", &slot);
 
         let features = Graph::load(
             bundle,
@@ -63,7 +64,7 @@ impl TractEngine {
         )?;
         let predict = (1..=spec.templates)
             .map(|k| {
-                let slot = |i| port(&format!("template{i}"), &[cells, width]);
+                let slot = |i| port(&format!("template{i}"), &slot);
                 let mut inputs: Vec<Port> = (0..k).map(slot).collect();
                 inputs.push(feature.clone());
                 let outputs = [scores.clone(), ltrb.clone()];
@@ -245,6 +246,33 @@ impl Graph {
     }
 }
 
+/// The shape that the `template` graph declares for what a slot keeps.
+fn declared_slot(bundle: &Bundle<'_>) -> Result<Option<Vec<i64>>, EngineError> {
+    let kind = SectionKind::TemplateOnnx;
+    let bytes = bundle.require(kind).map_err(|e| error(Stage::Load, format_args!("{e}")))?;
+    let proto = onnx()
+        .proto_model_for_read(&mut &*bytes)
+        .map_err(|e| error(Stage::Load, format_args!("{kind}: {e:#}")))?;
+    let output = proto.graph.iter().flat_map(|g| &g.output).find(|v| v.name == "tokens");
+    Ok(output.and_then(tensor_type).map(sides))
+}
+
+fn tensor_type(info: &pb::ValueInfoProto) -> Option<&type_proto::Tensor> {
+    match info.r#type.as_ref()?.value.as_ref()? {
+        type_proto::Value::TensorType(tensor) => Some(tensor),
+    }
+}
+
+/// Sides of a declared tensor; -1 where one is not fixed.
+fn sides(declared: &type_proto::Tensor) -> Vec<i64> {
+    let dims = declared.shape.iter().flat_map(|s| &s.dim);
+    dims.map(|d| match d.value {
+        Some(dimension::Value::DimValue(n)) => n,
+        _ => -1,
+    })
+    .collect()
+}
+
 /// Do the graph's declared inputs or outputs have the names and shapes they need?
 fn check_declared(
     kind: SectionKind,
@@ -257,21 +285,13 @@ fn check_declared(
         let Some(info) = found.iter().find(|v| v.name == *name) else {
             return fail(format_args!("{kind} has no {what} `{name}`"));
         };
-        let Some(type_proto::Value::TensorType(declared)) =
-            info.r#type.as_ref().and_then(|t| t.value.as_ref())
-        else {
+        let Some(declared) = tensor_type(info) else {
             return fail(format_args!("{kind}: {what} `{name}` has no tensor type"));
         };
         if declared.elem_type != tensor_proto::DataType::Float as i32 {
             return fail(format_args!("{kind}: {what} `{name}` must be f32"));
         }
-        let dims = declared.shape.iter().flat_map(|s| &s.dim);
-        let dims: Vec<i64> = dims
-            .map(|d| match d.value {
-                Some(dimension::Value::DimValue(n)) => n,
-                _ => -1,
-            })
-            .collect();
+        let dims = sides(declared);
         if !dims.iter().copied().eq(shape.iter().map(|&n| n as i64)) {
             return fail(format_args!(
                 "{kind}: {what} `{name}` is {dims:?}, the specification needs {shape:?}"

@@ -243,18 +243,42 @@ impl Head {
         }
     }
 
+    /// Tokens `(N, F*F, d)` of frames with their queries, keys and values in the first encoder
+    /// layer, `(N, F*F, 4d)`: all of a frame that does not depend on the other frames.
+    pub fn prepare(&self, tokens: Tensor<3>, side: usize) -> Tensor<3> {
+        let position = position(side, &tokens);
+        let projected = self.filter_predictor.transformer.project_first(tokens.clone(), position);
+        Tensor::cat(vec![tokens, projected], 2)
+    }
+
+    /// [`Self::predict_filter`] from prepared frames `(B, frames * F*F, 4d)`.
+    pub fn predict_filter_prepared(
+        &self,
+        prepared: Tensor<3>,
+        side: usize,
+    ) -> (Tensor<2>, Tensor<3>) {
+        let d = prepared.dims()[2] / 4;
+        let tokens = prepared.clone().narrow(2, 0, d);
+        let projected = prepared.narrow(2, d, 3 * d);
+        let position = position(side, &tokens);
+        let transformer = &self.filter_predictor.transformer;
+        let memory = transformer.encode_projected(tokens, projected, position.clone());
+        self.decode(memory, position)
+    }
+
     /// Filter `(B, d)` and encoded search frame `(B, F*F, d)` from tokens `(B, frames * F*F, d)`,
     /// the search frame last.
     pub fn predict_filter(&self, tokens: Tensor<3>, side: usize) -> (Tensor<2>, Tensor<3>) {
-        let [_, l, d] = tokens.dims();
-        let cells = side * side;
-        let code = TensorData::new(positional_code(side, d).repeat(l / cells), [1, l, d]);
-        // Constants stay outside autodiff whatever device the tokens live on.
-        let position = Tensor::<3>::from_data(code, &tokens.device()).inner();
+        let position = position(side, &tokens);
+        let memory = self.filter_predictor.transformer.encode(tokens, position.clone());
+        self.decode(memory, position)
+    }
+
+    fn decode(&self, memory: Tensor<3>, position: Tensor<3>) -> (Tensor<2>, Tensor<3>) {
+        let ([_, l, _], cells) = (memory.dims(), position.dims()[1]);
         let predictor = &self.filter_predictor;
-        let memory = predictor.transformer.encode(tokens, position.clone());
-        let filter =
-            predictor.transformer.decode(predictor.query_embed_fg.val(), memory.clone(), position);
+        let query = predictor.query_embed_fg.val();
+        let filter = predictor.transformer.decode(query, memory.clone(), position);
         (filter, memory.narrow(1, l - cells, cells))
     }
 
@@ -283,6 +307,14 @@ impl Head {
             .fold(x, |x, layer| relu(layer.norm.forward(layer.conv.forward(x))));
         regressor.bbreg_layer.forward(x).exp()
     }
+}
+
+/// The positional code of one frame, `(1, F*F, d)`, where `tokens` `(.., .., d)` are.
+fn position(side: usize, tokens: &Tensor<3>) -> Tensor<3> {
+    let d = tokens.dims()[2];
+    let code = TensorData::new(positional_code(side, d), [1, side * side, d]);
+    // Constants stay outside autodiff whatever device the tokens live on.
+    Tensor::from_data(code, &tokens.device()).inner()
 }
 
 /// `(N, d, F, F)` to `(N, F*F, d)`.

@@ -4,8 +4,8 @@
 //! the exporter records, and training is written around the same parts. For one crop
 //!
 //! 1. [`TrackerNet::features`] turns a crop into a head feature,
-//! 2. [`TrackerNet::template`] turns a head feature with label and box into template tokens,
-//! 3. [`TrackerNet::predict`] turns template tokens and a search feature into maps;
+//! 2. [`TrackerNet::template`] turns a head feature with label and box into what a slot keeps,
+//! 3. [`TrackerNet::predict`] turns filled slots and a search feature into maps;
 //!
 //! [`TrackerNet::forward_train`] is the single pass of spec 1.7 over a batch.
 //!
@@ -65,6 +65,32 @@ pub struct NetOptions {
 impl Default for NetOptions {
     fn default() -> Self {
         Self { dropout: 0.1, attention_dropout: 0.1, freeze: FreezePolicy::default() }
+    }
+}
+
+/// What a template slot keeps from frame to frame (spec 4.2). Both forms give the same maps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SlotForm {
+    /// Tokens, `(F*F, d)`.
+    Tokens,
+    /// Tokens with their queries (divided by the root of a head's depth), keys and values in the
+    /// first encoder layer, positional code and biases included, side by side: `(F*F, 4d)`.
+    Projected,
+}
+
+impl SlotForm {
+    /// The form in which networks of this shape are exported.
+    pub fn preferred(_spec: &ModelSpec) -> Self {
+        Self::Projected
+    }
+
+    /// Columns of a slot.
+    pub fn columns(self, spec: &ModelSpec) -> usize {
+        let d = usize::from(spec.width);
+        match self {
+            Self::Tokens => d,
+            Self::Projected => 4 * d,
+        }
     }
 }
 
@@ -128,40 +154,60 @@ impl TrackerNet {
         self.head.feature(self.feature_extractor.forward(crop, self.frozen))
     }
 
-    /// Template tokens `(F*F, d)` from a head feature `(1, d, F, F)`, the Gaussian label `(F, F)`
-    /// and the box as distances `(4, F, F)` in crop sides (spec 1.4).
+    /// What a slot keeps of a template, from its head feature `(1, d, F, F)`, the Gaussian label
+    /// `(F, F)` and the box as distances `(4, F, F)` in crop sides (spec 1.4): `(F*F, d)` or
+    /// `(F*F, 4d)`, the network's [`SlotForm::preferred`].
     pub fn template(&self, feature: Tensor<4>, label: Tensor<2>, ltrb: Tensor<3>) -> Tensor<2> {
+        self.template_as(SlotForm::preferred(&self.spec), feature, label, ltrb)
+    }
+
+    /// [`Self::template`] in a form of choice.
+    pub fn template_as(
+        &self,
+        form: SlotForm,
+        feature: Tensor<4>,
+        label: Tensor<2>,
+        ltrb: Tensor<3>,
+    ) -> Tensor<2> {
         let [_, d, f, _] = feature.dims();
         let tokens = self.head.template_tokens(
             feature,
             label.reshape([1, f, f]),
             ltrb.reshape([1, 4, f, f]),
         );
-        tokens.reshape([f * f, d])
+        match form {
+            SlotForm::Tokens => tokens.reshape([f * f, d]),
+            SlotForm::Projected => self.head.prepare(tokens, f).reshape([f * f, 4 * d]),
+        }
     }
 
     /// Score map `(F, F)` and distances `(4, F, F)` of a search feature `(1, d, F, F)` against the
-    /// tokens of the filled slots, slot 0 (the annotated frame) first: the tracking mode of
-    /// spec 1.7, with the box row as a second, shorter sequence (spec 4.3.1).
+    /// filled slots in any [`SlotForm`], slot 0 (the annotated frame) first: the tracking mode of
+    /// spec 1.7, with the box row as a second, shorter sequence (spec 4.3.1). What a frame
+    /// contributes to the first encoder layer is computed once for both.
     ///
     /// # Panics
     /// When `templates` is empty; [`crate::burn_engine::BurnEngine`] checks.
     pub fn predict(&self, templates: Vec<Tensor<2>>, search: Tensor<4>) -> (Tensor<2>, Tensor<3>) {
-        assert!(!templates.is_empty(), "predict needs the tokens of at least one template");
-        let side = search.dims()[2];
-        let count = templates.len();
-        let search = self.head.search_tokens(search);
-        let sequence = |templates: &[Tensor<2>]| {
-            let frames = templates.iter().map(|t| t.clone().unsqueeze_dim::<3>(0));
-            Tensor::cat(frames.chain([search.clone()]).collect(), 1)
+        assert!(!templates.is_empty(), "predict needs the slot of at least one template");
+        let [_, d, side, _] = search.dims();
+        let search = self.head.prepare(self.head.search_tokens(search), side);
+        let frames: Vec<Tensor<3>> = templates
+            .into_iter()
+            .map(|slot| {
+                let width = slot.dims()[1];
+                let slot = slot.unsqueeze_dim::<3>(0);
+                if width == d { self.head.prepare(slot, side) } else { slot }
+            })
+            .collect();
+        let run = |frames: &[Tensor<3>]| {
+            let sequence = frames.iter().chain([&search]).cloned().collect();
+            self.head.predict_filter_prepared(Tensor::cat(sequence, 1), side)
         };
-        let (filter, encoded) = self.head.predict_filter(sequence(&templates), side);
+        let (filter, encoded) = run(&frames);
         let scores = self.head.scores(filter.clone(), encoded.clone(), side);
-        let (filter, encoded) = if count == 1 {
-            (filter, encoded)
-        } else {
-            self.head.predict_filter(sequence(&templates[..1]), side)
-        };
+        let (filter, encoded) =
+            if frames.len() == 1 { (filter, encoded) } else { run(&frames[..1]) };
         let ltrb = self.head.ltrb(filter, encoded, side);
         (scores.reshape([side, side]), ltrb.reshape([4, side, side]))
     }

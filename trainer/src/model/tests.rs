@@ -1,5 +1,8 @@
 //! The network against the reference (golden vectors) and against itself.
 
+mod as_written;
+mod rearrangements;
+
 use super::*;
 use crate::import::{self, StateDict, StateTensor};
 use crate::losses::{LossWeights, losses};

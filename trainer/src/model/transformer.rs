@@ -73,19 +73,42 @@ impl Attention {
         (weight, self.in_proj_bias.val().narrow(0, from, to - from))
     }
 
-    /// Self-attention over `(B, L, d)` with the positional code `(1, L, d)` on queries and keys.
-    fn self_attention(&self, x: Tensor<3>, position: Tensor<3>) -> Tensor<3> {
+    /// Queries (divided by the root of a head's depth), keys and values of tokens `(B, L, d)`, side
+    /// by side as `(B, L, 3d)`; `position` `(1, C, d)` is the code of one frame, on queries and keys.
+    ///
+    /// One product for all three: `(x + P) W = x W + P W`, and `P W` with the biases is a constant
+    /// per cell (spec 4.2).
+    fn project(&self, x: Tensor<3>, position: Tensor<3>) -> Tensor<3> {
         let [b, l, d] = x.dims();
-        let (heads, depth) = (self.heads, d / self.heads);
-        let (w_qk, b_qk) = self.projection(0, 2 * d);
-        let (w_v, b_v) = self.projection(2 * d, 3 * d);
-        let qk = linear(x.clone() + position, w_qk, Some(b_qk));
-        let v = linear(x, w_v, Some(b_v));
-        let split = |t: Tensor<3>| t.reshape([b, l, heads, depth]).swap_dims(1, 2);
-        let q = split(qk.clone().narrow(2, 0, d)).mul_scalar(1.0 / (depth as f64).sqrt());
-        let k = split(qk.narrow(2, d, d));
-        let weights = self.dropout.forward(softmax(q.matmul(k.swap_dims(2, 3)), 3));
-        let mixed = weights.matmul(split(v)).swap_dims(1, 2).reshape([b, l, d]);
+        let cells = position.dims()[1];
+        let scale = 1.0 / ((d / self.heads) as f64).sqrt();
+        let scaled = |from: usize, to: usize| {
+            let (weight, bias) = self.projection(from, to);
+            if from == 0 { (weight * scale, bias * scale) } else { (weight, bias) }
+        };
+        let ((w_q, b_q), (w_k, b_k)) = (scaled(0, d), scaled(d, 2 * d));
+        let (w_v, b_v) = scaled(2 * d, 3 * d);
+        let w_qk = Tensor::cat(vec![w_q, w_k], 1);
+        let by_cell = linear(position, w_qk.clone(), Some(Tensor::cat(vec![b_q, b_k], 0)));
+        let b_v = b_v.reshape([1, 1, d]).repeat_dim(1, cells);
+        let by_cell = Tensor::cat(vec![by_cell, b_v], 2);
+        let frames = x.reshape([b * l / cells, cells, d]);
+        let projected = linear(frames, Tensor::cat(vec![w_qk, w_v], 1), None) + by_cell;
+        projected.reshape([b, l, 3 * d])
+    }
+
+    /// Self-attention among the tokens whose [`Self::project`] this is: `(B, L, 3d)` to `(B, L, d)`.
+    fn attend(&self, projected: Tensor<3>) -> Tensor<3> {
+        let [b, l, d3] = projected.dims();
+        let d = d3 / 3;
+        let depth = d / self.heads;
+        let part = |from: usize| {
+            let part = projected.clone().narrow(2, from, d);
+            part.reshape([b, l, self.heads, depth]).swap_dims(1, 2)
+        };
+        let logits = part(0).matmul(part(d).swap_dims(2, 3));
+        let weights = self.dropout.forward(softmax(logits, 3));
+        let mixed = weights.matmul(part(2 * d)).swap_dims(1, 2).reshape([b, l, d]);
         self.out_proj.forward(mixed)
     }
 
@@ -105,14 +128,9 @@ impl Attention {
         self.out_proj.forward(self.in_proj_bias.val().narrow(0, d3 - d, d).reshape([1, d]))
     }
 
-    /// Attention of one query `(B, d)` on a memory `(B, L, d)` whose keys carry `position`
-    /// `(1, L, d)`, computed in memory space (spec 4.3.3): no key or value is ever projected.
-    fn cross_attention(
-        &self,
-        query: Tensor<2>,
-        memory: Tensor<3>,
-        position: Tensor<3>,
-    ) -> Tensor<2> {
+    /// Attention of one query `(B, d)` on a memory, computed in memory space (spec 4.3.3): no key
+    /// or value is ever projected.
+    fn cross_attention(&self, query: Tensor<2>, memory: &Memory) -> Tensor<2> {
         let [b, d] = query.dims();
         let (heads, depth) = (self.heads, d / self.heads);
         let (w_q, b_q) = self.projection(0, d);
@@ -124,9 +142,9 @@ impl Attention {
         // (h, B, depth) x (h, depth, d): the query of every head in memory space. The key bias adds
         // one number to all logits of a head and cancels in the softmax.
         let q = q.matmul(per_head(d)).swap_dims(0, 1);
-        let logits = q.matmul((memory.clone() + position).swap_dims(1, 2));
+        let logits = q.matmul(memory.coded.clone().swap_dims(1, 2));
         let weights = self.dropout.forward(softmax(logits, 2));
-        let context = weights.clone().matmul(memory).swap_dims(0, 1);
+        let context = weights.clone().matmul(memory.tokens.clone()).swap_dims(0, 1);
         let values = context.matmul(per_head(2 * d).swap_dims(1, 2)).swap_dims(0, 1);
         let bias = self.in_proj_bias.val().narrow(0, 2 * d, d).reshape([1, heads, depth]);
         // Weights sum to 1 unless some were dropped.
@@ -161,7 +179,13 @@ impl EncoderLayer {
     }
 
     fn forward(&self, x: Tensor<3>, position: Tensor<3>) -> Tensor<3> {
-        let a = self.dropout.forward(self.self_attn.self_attention(x.clone(), position));
+        let projected = self.self_attn.project(x.clone(), position);
+        self.forward_projected(x, projected)
+    }
+
+    /// [`Self::forward`] where the projections of the tokens, `(B, L, 3d)`, are known.
+    fn forward_projected(&self, x: Tensor<3>, projected: Tensor<3>) -> Tensor<3> {
+        let a = self.dropout.forward(self.self_attn.attend(projected));
         let x = self.norm1.forward(x + a);
         let h = self.dropout.forward(relu(self.linear1.forward(x.clone())));
         let f = self.dropout.forward(self.linear2.forward(h));
@@ -198,14 +222,8 @@ impl DecoderLayer {
     }
 
     /// `token` is `None` for the zero token the first layer starts from.
-    fn forward(
-        &self,
-        token: Option<Tensor<2>>,
-        query: Tensor<2>,
-        memory: Tensor<3>,
-        position: Tensor<3>,
-    ) -> Tensor<2> {
-        let b = memory.dims()[0];
+    fn forward(&self, token: Option<Tensor<2>>, query: Tensor<2>, memory: &Memory) -> Tensor<2> {
+        let b = memory.tokens.dims()[0];
         let t = match token {
             Some(t) => {
                 let a = self.self_attn.single_self_attention(t.clone());
@@ -218,11 +236,29 @@ impl DecoderLayer {
             }
         };
         let t = self.norm1.forward(t);
-        let a = self.multihead_attn.cross_attention(t.clone() + query, memory, position);
+        let a = self.multihead_attn.cross_attention(t.clone() + query, memory);
         let t = self.norm2.forward(t + self.dropout.forward(a));
         let h = self.dropout.forward(relu(self.linear1.forward(t.clone())));
         let f = self.dropout.forward(self.linear2.forward(h));
         self.norm3.forward(t + f)
+    }
+}
+
+/// What the decoder attends to.
+struct Memory {
+    /// Values, `(B, L, d)`.
+    tokens: Tensor<3>,
+    /// Keys, `(B, L, d)`: the tokens with their positional code; the same for every layer.
+    coded: Tensor<3>,
+}
+
+impl Memory {
+    /// `position` `(1, C, d)` is the code of one frame.
+    fn new(tokens: Tensor<3>, position: Tensor<3>) -> Self {
+        let [b, l, d] = tokens.dims();
+        let cells = position.dims()[1];
+        let coded = tokens.clone().reshape([b * l / cells, cells, d]) + position;
+        Self { tokens, coded: coded.reshape([b, l, d]) }
     }
 }
 
@@ -272,20 +308,46 @@ impl Transformer {
         }
     }
 
-    /// Tokens `(B, L, d)` with positional code `(1, L, d)` to memory `(B, L, d)`.
+    /// Tokens `(B, L, d)` of whole frames to memory `(B, L, d)`; `position` `(1, C, d)` is the
+    /// positional code of one frame.
     pub fn encode(&self, tokens: Tensor<3>, position: Tensor<3>) -> Tensor<3> {
         self.encoder.layers.iter().fold(tokens, |x, layer| layer.forward(x, position.clone()))
     }
 
-    /// The target filter `(B, d)` from the memory `(B, L, d)`; `query` is `e_fg`, `(1, d)`.
+    /// Queries, keys and values `(B, L, 3d)` of tokens `(B, L, d)` in the first encoder layer. They
+    /// depend on the token and its cell only, so those of a template are known when it is written
+    /// (spec 4.2).
+    pub fn project_first(&self, tokens: Tensor<3>, position: Tensor<3>) -> Tensor<3> {
+        match self.encoder.layers.first() {
+            Some(layer) => layer.self_attn.project(tokens, position),
+            // `ModelSpec::validate` asks for at least one encoder layer.
+            None => tokens.repeat_dim(2, 3),
+        }
+    }
+
+    /// [`Self::encode`] of tokens `(B, L, d)` with their [`Self::project_first`], `(B, L, 3d)`.
+    pub fn encode_projected(
+        &self,
+        tokens: Tensor<3>,
+        projected: Tensor<3>,
+        position: Tensor<3>,
+    ) -> Tensor<3> {
+        let Some((first, others)) = self.encoder.layers.split_first() else { return tokens };
+        let x = first.forward_projected(tokens, projected);
+        others.iter().fold(x, |x, layer| layer.forward(x, position.clone()))
+    }
+
+    /// The target filter `(B, d)` from the memory `(B, L, d)`; `query` is `e_fg`, `(1, d)`,
+    /// `position` `(1, C, d)` the positional code of one frame.
     pub fn decode(&self, query: Tensor<2>, memory: Tensor<3>, position: Tensor<3>) -> Tensor<2> {
+        let [b, _, d] = memory.dims();
+        let memory = Memory::new(memory, position);
         let mut token: Option<Tensor<2>> = None;
         for layer in &self.decoder.layers {
-            token = Some(layer.forward(token, query.clone(), memory.clone(), position.clone()));
+            token = Some(layer.forward(token, query.clone(), &memory));
         }
         // `ModelSpec::validate` asks for at least one decoder layer.
-        let [b, _, d] = memory.dims();
-        let token = token.unwrap_or_else(|| Tensor::zeros([b, d], &memory.device()));
+        let token = token.unwrap_or_else(|| Tensor::zeros([b, d], &memory.tokens.device()));
         self.decoder.norm.forward(token)
     }
 }

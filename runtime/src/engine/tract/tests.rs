@@ -275,6 +275,35 @@ fn a_hand_computed_network_gives_the_same_numbers() {
     }
 }
 
+/// A bundle whose slots hold more than tokens: the engine takes their shape from the graphs.
+#[test]
+fn slots_have_the_shape_that_the_graphs_declare() {
+    let mut wide = template();
+    let graph = wide.graph.as_mut().unwrap();
+    graph.node.last_mut().unwrap().output[0] = "one".into();
+    graph.node.push(node("Concat", &["one"; 4], "tokens", vec![int("axis", 1)]));
+    graph.output[0] = value("tokens", &[CELLS, 16]);
+    let mut parts = parts();
+    parts[1].1 = wide.encode_to_vec();
+    for k in 1..=2 {
+        let mut model = predict(k);
+        let inputs = &mut model.graph.as_mut().unwrap().input;
+        for (i, input) in inputs.iter_mut().skip(1).enumerate() {
+            *input = value(&format!("template{i}"), &[CELLS, 16]);
+        }
+        parts[1 + k].1 = model.encode_to_vec();
+    }
+    let boxes = probe::default_boxes(&SPEC);
+    let section = probe::capture(&mut load(&self::parts()).unwrap(), &boxes).unwrap();
+    let probe = probe::Probe::parse(&section, &SPEC).unwrap();
+    // The mean over four equal blocks is the mean over one.
+    assert!(probe::run(&mut load(&parts).unwrap(), &probe).unwrap().max() < 1e-6);
+    // All graphs have to say the same.
+    parts[2].1 = predict(1).encode_to_vec();
+    let message = load(&parts).unwrap_err().to_string();
+    assert!(message.contains("predict1.onnx: input `template0`"), "{message}");
+}
+
 #[test]
 fn two_engines_of_one_bundle_agree_on_the_probe_and_can_be_sent_to_threads() {
     let boxes = probe::default_boxes(&SPEC);
@@ -336,7 +365,17 @@ fn what_is_wrong_with_a_bundle_is_named() {
     lying.graph.as_mut().unwrap().initializer[0] = shape_const("map", &[4, 9, 1]);
     let mut unknown = predict(2);
     unknown.graph.as_mut().unwrap().node[1].op_type = "Frobnicate".into();
-    let cases: [(String, &[&str]); 11] = [
+    let slot = |sides: &[usize]| {
+        let mut other = template();
+        other.graph.as_mut().unwrap().output[0] = value("tokens", sides);
+        with(1, other.encode_to_vec())
+    };
+    let cases: [(String, &[&str]); 15] = [
+        (slot(&[CELLS, 6]), &["template.onnx: output `tokens`", "[9, n * 4]", "[9, 6]"]),
+        (slot(&[CELLS + 1, 4]), &["template.onnx: output `tokens`", "[10, 4]"]),
+        (slot(&[CELLS, 4, 1]), &["template.onnx: output `tokens`", "[9, 4, 1]"]),
+        // Declared otherwise than computed.
+        (slot(&[CELLS, 16]), &["template.onnx", "tokens"]),
         (with(0, b"\xff\xff".to_vec()), &["features.onnx"]),
         (with(0, Vec::new()), &["features.onnx", "no graph"]),
         (with(0, wide.encode_to_vec()), &["features.onnx", "`crop`", "[1, 3, 48, 48]"]),
