@@ -103,7 +103,7 @@ impl AsWritten<'_> {
         let pool = MaxPoolOptions {
             kernel_size: [3; 2],
             stride: [2; 2],
-            padding: [1; 2],
+            padding: [(1, 1); 2],
             dilation: [1; 2],
             ceil_mode: false,
         };

@@ -121,7 +121,7 @@ fn every_rearrangement_equals_the_reference_as_written() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 12, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
 
     #[test]
     fn rearrangements_hold_for_any_shape(
