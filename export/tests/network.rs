@@ -71,9 +71,10 @@ fn tract_equals_burn_and_weights_are_stored_once() {
         assert_eq!(report.differences.len(), engines * 2 * usize::from(spec.templates));
         assert!(report.max() <= TOLERANCE, "{name}: differs by {}", report.max());
         // Each parameter once, though three or four graphs use them; beside them the positional
-        // codes of every predict graph, folded constants, the graphs themselves and the probe.
+        // code, its products in every encoder layer (once for all graphs), folded constants, the
+        // graphs themselves and the probe.
         let code = 4 * spec.cells() * usize::from(spec.width);
-        let codes: usize = (1..=usize::from(spec.templates)).map(|k| (2 * k + 3) * code).sum();
+        let codes = (3 * usize::from(spec.encoder_layers) + 1) * code;
         let most = 4 * parameters + codes + 200_000;
         assert!(bytes.len() < most, "{name}: {} bytes, at most {most} expected", bytes.len());
         let weights = file.require(SectionKind::Weights).unwrap().len();

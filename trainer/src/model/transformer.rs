@@ -142,7 +142,7 @@ impl Attention {
         // (h, B, depth) x (h, depth, d): the query of every head in memory space. The key bias adds
         // one number to all logits of a head and cancels in the softmax.
         let q = q.matmul(per_head(d)).swap_dims(0, 1);
-        let logits = q.matmul(memory.coded.clone().swap_dims(1, 2));
+        let logits = q.matmul(memory.keys.clone());
         let weights = self.dropout.forward(softmax(logits, 2));
         let context = weights.clone().matmul(memory.tokens.clone()).swap_dims(0, 1);
         let values = context.matmul(per_head(2 * d).swap_dims(1, 2)).swap_dims(0, 1);
@@ -248,8 +248,8 @@ impl DecoderLayer {
 struct Memory {
     /// Values, `(B, L, d)`.
     tokens: Tensor<3>,
-    /// Keys, `(B, L, d)`: the tokens with their positional code; the same for every layer.
-    coded: Tensor<3>,
+    /// Keys, `(B, d, L)`: the tokens with their positional code; the same for every layer.
+    keys: Tensor<3>,
 }
 
 impl Memory {
@@ -257,8 +257,8 @@ impl Memory {
     fn new(tokens: Tensor<3>, position: Tensor<3>) -> Self {
         let [b, l, d] = tokens.dims();
         let cells = position.dims()[1];
-        let coded = tokens.clone().reshape([b * l / cells, cells, d]) + position;
-        Self { tokens, coded: coded.reshape([b, l, d]) }
+        let keys = tokens.clone().reshape([b * l / cells, cells, d]) + position;
+        Self { tokens, keys: keys.reshape([b, l, d]).swap_dims(1, 2) }
     }
 }
 

@@ -35,8 +35,8 @@ pub(super) struct Converter<'a> {
     constants: &'a BTreeMap<TensorId, TensorData>,
     /// Layer the operation being converted belongs to; names what it computes.
     scope: String,
-    /// The layer of everything converted so far.
-    scopes: HashMap<TensorId, String>,
+    /// The layer of everything converted so far, and when it was computed.
+    scopes: HashMap<TensorId, (usize, String)>,
     /// Tensors that depend on no input.
     fixed: HashSet<TensorId>,
 }
@@ -156,20 +156,24 @@ impl<'a> Converter<'a> {
 
     /// Finds the layer of an operation: `backbone.layer1.0.conv1` where it reads
     /// `backbone.layer1.0.conv1.weight` or something computed from that alone, otherwise the layer
-    /// of its last input, so that activations and sums go by the layer before them.
+    /// of the input computed last, so that activations and sums go by the layer before them and
+    /// attention by the layer of its query, not of the memory it reads.
     fn place(&mut self, operation: &OperationIr) {
         let inputs: Vec<TensorId> = operation.inputs().map(|t| t.id).collect();
         let parent = |id| self.recorder.names.get(id)?.rsplit_once('.').map(|(parent, _)| parent);
-        let known = |id| self.scopes.get(id).map(String::as_str);
+        let known = |id| self.scopes.get(id).filter(|(_, scope)| !scope.is_empty());
         let own = inputs.iter().find_map(parent);
-        let weights = || inputs.iter().filter(|id| self.fixed.contains(id)).find_map(known);
-        let before = || inputs.iter().rev().find_map(known);
-        let scope = own.or_else(weights).or_else(before).unwrap_or_default().to_owned();
+        let latest = |fixed: bool| {
+            let among = inputs.iter().filter(|id| !fixed || self.fixed.contains(id));
+            among.filter_map(known).max_by_key(|(order, _)| *order)
+        };
+        let placed = || latest(true).or_else(|| latest(false)).map(|(_, scope)| scope.as_str());
+        let scope = own.or_else(placed).unwrap_or_default().to_owned();
         let fixed = inputs.iter().all(|id| self.fixed.contains(id));
         for out in operation.outputs() {
             // Initialised tensors are no results; they have their own names.
             if !matches!(operation, OperationIr::Init(_) | OperationIr::Drop(_)) {
-                self.scopes.insert(out.id, scope.clone());
+                self.scopes.insert(out.id, (self.scopes.len(), scope.clone()));
                 if fixed {
                     self.fixed.insert(out.id);
                 }

@@ -125,6 +125,7 @@ fn read_unexpanded(graph: &mut Graph, i: usize) -> bool {
 /// Products with a constant matrix read it as a plain matrix: engines know that form best.
 pub(super) fn plain_matrices(graph: &mut Graph) -> bool {
     let uses = graph.uses();
+    let mut copies: HashMap<ValueId, ValueId> = HashMap::new();
     let mut changed = false;
     for i in 0..graph.nodes.len() {
         let node = &graph.nodes[i];
@@ -142,8 +143,15 @@ pub(super) fn plain_matrices(graph: &mut Graph) -> bool {
         if uses.get(&rhs) == Some(&1) {
             graph.set_dims(rhs, &matrix);
         } else {
-            let (data, name) = (data.clone(), graph.value(rhs).name.clone());
-            graph.nodes[i].inputs[1] = Some(graph.add_constant(&name, &matrix, data));
+            let copy = match copies.get(&rhs) {
+                Some(copy) => *copy,
+                None => {
+                    let (data, name) = (data.clone(), graph.value(rhs).name.clone());
+                    graph.add_constant(&name, &matrix, data)
+                }
+            };
+            copies.insert(rhs, copy);
+            graph.nodes[i].inputs[1] = Some(copy);
         }
         changed = true;
     }

@@ -13,13 +13,14 @@ use std::collections::HashSet;
 pub fn optimise(graph: &mut Graph) {
     let passes: [fn(&mut Graph) -> bool; 8] = [
         remove_dead,
+        // Before folding, so that what several places compute from weights stays one constant.
+        cleanup::join_equal,
         fold::constants,
         cleanup::no_ops,
         affine::into_convolutions,
         affine::into_products,
         affine::padding_into_convolutions,
         cleanup::plain_matrices,
-        cleanup::join_equal,
     ];
     // Every pass that reports a change has made the graph smaller or a value constant.
     while passes.iter().fold(false, |changed, pass| pass(graph) | changed) {}
