@@ -213,9 +213,14 @@ impl Subject {
 struct Loaded {
     state: TypedSimpleState,
     inputs: Vec<TValue>,
-    /// Milliseconds.
+    /// Runs in a row per measurement.
+    repeats: usize,
+    /// Milliseconds per run.
     times: Vec<f64>,
 }
+
+/// Milliseconds that a measurement takes at least: processor time comes in steps of a few.
+const SHORTEST: f64 = 200.0;
 
 impl Loaded {
     fn new(graph: &Graph) -> anyhow::Result<Self> {
@@ -232,13 +237,27 @@ impl Loaded {
             let values: Vec<f32> = (0..dims.iter().product()).map(|_| noise()).collect();
             tract_onnx::prelude::Tensor::from_shape(dims, &values).map(TValue::from)
         });
-        Ok(Self { state, inputs: inputs.collect::<Result<_, _>>()?, times: Vec::new() })
+        Ok(Self { state, inputs: inputs.collect::<Result<_, _>>()?, repeats: 1, times: Vec::new() })
     }
 
-    fn run(&mut self) -> anyhow::Result<()> {
+    /// Finds out how many runs make a measurement long enough.
+    fn warm_up(&mut self) -> anyhow::Result<()> {
+        loop {
+            self.measure()?;
+            let last = self.times.pop().unwrap_or_default() * self.repeats as f64;
+            if last >= SHORTEST || self.repeats >= 10_000 {
+                return Ok(());
+            }
+            self.repeats *= 2;
+        }
+    }
+
+    fn measure(&mut self) -> anyhow::Result<()> {
         let start = Clock::now();
-        self.state.run(self.inputs.iter().cloned().collect())?;
-        self.times.push(start.milliseconds());
+        for _ in 0..self.repeats {
+            self.state.run(self.inputs.iter().cloned().collect())?;
+        }
+        self.times.push(start.milliseconds() / self.repeats as f64);
         Ok(())
     }
 
@@ -311,13 +330,12 @@ fn compare(title: &str, file: &str, variants: &[Variant], args: &Args) -> anyhow
     }
     let mut loaded =
         variants.iter().map(|v| Loaded::new(&v.graph)).collect::<anyhow::Result<Vec<_>>>()?;
-    // One round to warm up.
-    for round in 0..=args.rounds {
+    for variant in &mut loaded {
+        variant.warm_up()?;
+    }
+    for _ in 0..args.rounds {
         for variant in &mut loaded {
-            variant.run()?;
-            if round == 0 {
-                variant.times.clear();
-            }
+            variant.measure()?;
         }
     }
     println!("\n{title}\n");

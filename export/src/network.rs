@@ -25,7 +25,7 @@ pub struct NetworkGraph {
 /// # Errors
 /// When the network uses an operation that the converter does not know.
 pub fn graphs(net: &TrackerNet) -> Result<Vec<NetworkGraph>, ExportError> {
-    graphs_as(net, SlotForm::preferred(net.spec()))
+    graphs_as(net, SlotForm::default())
 }
 
 /// [`graphs`] with a form of slot of choice.

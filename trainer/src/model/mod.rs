@@ -68,22 +68,21 @@ impl Default for NetOptions {
     }
 }
 
-/// What a template slot keeps from frame to frame (spec 4.2). Both forms give the same maps.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// What a template slot keeps from frame to frame (spec 4.2). Both forms give the same maps; the
+/// default is what networks are exported with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum SlotForm {
     /// Tokens, `(F*F, d)`.
     Tokens,
     /// Tokens with their queries (divided by the root of a head's depth), keys and values in the
-    /// first encoder layer, positional code and biases included, side by side: `(F*F, 4d)`.
+    /// first encoder layer, positional code and biases included, side by side: `(F*F, 4d)`. Less
+    /// work even if every frame is remembered: one frame's projections at the memory write against
+    /// one per filled slot and search frame.
+    #[default]
     Projected,
 }
 
 impl SlotForm {
-    /// The form in which networks of this shape are exported.
-    pub fn preferred(_spec: &ModelSpec) -> Self {
-        Self::Projected
-    }
-
     /// Columns of a slot.
     pub fn columns(self, spec: &ModelSpec) -> usize {
         let d = usize::from(spec.width);
@@ -155,10 +154,10 @@ impl TrackerNet {
     }
 
     /// What a slot keeps of a template, from its head feature `(1, d, F, F)`, the Gaussian label
-    /// `(F, F)` and the box as distances `(4, F, F)` in crop sides (spec 1.4): `(F*F, d)` or
-    /// `(F*F, 4d)`, the network's [`SlotForm::preferred`].
+    /// `(F, F)` and the box as distances `(4, F, F)` in crop sides (spec 1.4): `(F*F, 4d)`, the
+    /// default [`SlotForm`].
     pub fn template(&self, feature: Tensor<4>, label: Tensor<2>, ltrb: Tensor<3>) -> Tensor<2> {
-        self.template_as(SlotForm::preferred(&self.spec), feature, label, ltrb)
+        self.template_as(SlotForm::default(), feature, label, ltrb)
     }
 
     /// [`Self::template`] in a form of choice.
