@@ -119,12 +119,28 @@ impl ModelSpec {
         ..Self::TOMP101
     };
 
+    /// The small network of the golden figures: every part of ToMP at a size that a test runs in
+    /// moments.
+    pub const SMALL: Self = Self {
+        backbone: Backbone::ResNet { base_channels: 16, blocks: [2, 2, 3] },
+        crop: 144,
+        search_factor: 5.0,
+        width: 64,
+        heads: 4,
+        feed_forward: 128,
+        encoder_layers: 2,
+        decoder_layers: 2,
+        ltrb_hidden: 16,
+        ..Self::NANO
+    };
+
     /// The preset of this name, if there is one.
     pub fn preset(name: &str) -> Option<Self> {
         match name {
             "nano" => Some(Self::NANO),
             "tomp50" => Some(Self::TOMP50),
             "tomp101" => Some(Self::TOMP101),
+            "small" => Some(Self::SMALL),
             _ => None,
         }
     }
@@ -301,7 +317,7 @@ mod tests {
 
     #[test]
     fn presets_are_valid_and_named() {
-        for name in ["nano", "tomp50", "tomp101"] {
+        for name in ["nano", "tomp50", "tomp101", "small"] {
             ModelSpec::preset(name).unwrap().validate().unwrap();
         }
         assert!(ModelSpec::preset("tomp").is_none());

@@ -1,6 +1,8 @@
 //! Everything after the backbone: head feature, encodings, filter prediction, classifier and box
 //! regressor (spec 1.3 to 1.8).
 
+mod inspect;
+
 use super::kernels;
 use super::layers::{
     Conv, Geometry, filled, instance_l2_norm, instance_l2_norm_wide, positional_code, uniform,

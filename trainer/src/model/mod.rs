@@ -34,6 +34,7 @@
 mod backbone;
 mod efficientnet;
 mod head;
+pub mod inspect;
 mod kernels;
 mod layers;
 mod names;

@@ -1,5 +1,7 @@
 //! Bottleneck ResNet up to its third stage (spec 1.2).
 
+mod inspect;
+
 use super::layers::{Activation, Conv, FrozenBatchNorm, Geometry, conv_bn};
 use burn::prelude::*;
 use burn::tensor::module::max_pool2d;

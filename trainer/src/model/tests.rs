@@ -13,19 +13,7 @@ use tsda_runtime::Backbone;
 
 /// The small configuration of the golden vectors.
 fn small(test_embedding: bool) -> ModelSpec {
-    ModelSpec {
-        backbone: Backbone::ResNet { base_channels: 16, blocks: [2, 2, 3] },
-        crop: 144,
-        search_factor: 5.0,
-        width: 64,
-        heads: 4,
-        feed_forward: 128,
-        encoder_layers: 2,
-        decoder_layers: 2,
-        ltrb_hidden: 16,
-        test_embedding,
-        ..ModelSpec::NANO
-    }
+    ModelSpec { test_embedding, ..ModelSpec::SMALL }
 }
 
 const NO_DROPOUT: NetOptions =

@@ -1,6 +1,8 @@
 //! Encoder and decoder of the filter predictor (spec 1.6), written so that training and the
 //! exported graphs share every line: exact re-arrangements of spec 4.3, dropout where it belongs.
 
+mod inspect;
+
 use super::layers::{filled, uniform};
 use burn::module::Param;
 use burn::nn::{Dropout, DropoutConfig, LayerNorm, LayerNormConfig, Linear, LinearConfig};
