@@ -6,6 +6,7 @@
 //!    ([`bundle`]).
 //! 4. [`check`] compares every engine with the reference outputs; [`unpack`] takes a bundle apart;
 //!    [`macs`] counts what it computes.
+//! 5. [`golden`] compares every back end with reference figures of the network.
 //!
 //! The command line is `tsda-export` (`src/main.rs`).
 
@@ -13,6 +14,7 @@ pub mod build;
 pub mod bundle;
 pub mod check;
 pub mod files;
+pub mod golden;
 pub mod macs;
 pub mod network;
 pub mod onnx;

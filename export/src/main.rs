@@ -1,6 +1,10 @@
-//! `tsda-export`: build, check, unpack bundles, and count what they compute.
+//! `tsda-export`: build, check and unpack bundles, count what they compute, compare back ends with
+//! golden figures.
 //!
 //! Exit codes: 0 done; 1 an engine differs by more than the tolerance; 2 bad input.
+
+#[path = "golden_cli.rs"]
+mod golden;
 
 use anyhow::Context as _;
 use clap::{Parser, Subcommand};
@@ -59,6 +63,8 @@ enum Command {
         #[arg(long, default_value_t = 1e-4, value_parser = tolerance)]
         tolerance: f32,
     },
+    /// Compares back ends with golden figures of the network, tensor by tensor.
+    Golden(golden::GoldenArgs),
     /// Writes the parts of a bundle as plain files: ONNX graphs, weights, manifest, card.
     Unpack {
         /// The bundle.
@@ -136,6 +142,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
             println!("\nlargest difference {max:.3e}, allowed {tolerance:.3e}: too large");
             Ok(ExitCode::FAILURE)
         }
+        Command::Golden(args) => golden::run(&args),
         Command::Unpack { bundle, dir } => {
             let file = BundleFile::open(&bundle)?;
             for path in unpack(&file.bundle()?, &dir)? {

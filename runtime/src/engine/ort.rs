@@ -4,6 +4,7 @@
 //! `ORT_DYLIB_PATH`, else the system's `libonnxruntime.so`; 1.17 or newer. The PyPI wheel holds one
 //! (`onnxruntime/capi/libonnxruntime.so.*`).
 
+pub mod graph;
 mod inline;
 
 use super::{Engine, EngineError, Maps, Stage, TemplateInput, slot_shape};
