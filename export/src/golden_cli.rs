@@ -65,7 +65,9 @@ fn engines(names: &[String]) -> anyhow::Result<Vec<EngineKind>> {
                 if compiled {
                     chosen.push(kind);
                 } else {
-                    eprintln!("{name}: not part of this program (cargo feature `{name}`), left out");
+                    eprintln!(
+                        "{name}: not part of this program (cargo feature `{name}`), left out"
+                    );
                 }
             }
         } else if let Some((kind, ..)) = EngineKind::ALL.iter().find(|(_, n, _)| n == name) {

@@ -98,6 +98,9 @@ pub enum HostError {
         /// What the engine said.
         source: Box<tsda_runtime::probe::ProbeError>,
     },
+    /// A script that cannot be replayed.
+    #[error(transparent)]
+    Replay(#[from] crate::replay::ReplayError),
     /// An evaluation could not be finished.
     #[error("evaluation: {0}")]
     Eval(#[source] Box<dyn std::error::Error + Send + Sync>),
@@ -116,6 +119,7 @@ impl HostError {
             | Self::Init { .. }
             | Self::Argument { .. }
             | Self::Probe { .. }
+            | Self::Replay(_)
             | Self::Create { .. } => EXIT_BAD_INPUT,
             Self::Write { .. }
             | Self::Encode { .. }

@@ -6,7 +6,8 @@
 //! 2. [`model`]: the embedded bundle or one from a file, and the tracker built from it.
 //! 3. [`track`]: drives a tracker on any engine through a source into outputs.
 //! 4. [`video`]: GIF, page, PNG files, strip; [`metrics`]: figures against known boxes.
-//! 5. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
+//! 5. [`replay`]: scripted runs, to check the tracker frame by frame.
+//! 6. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
 //!    appear whole or not at all.
 
 pub mod cli;
@@ -17,6 +18,7 @@ pub mod model;
 pub mod output;
 pub mod picture;
 pub mod render;
+pub mod replay;
 pub mod sequence;
 pub mod track;
 pub mod video;

@@ -168,7 +168,10 @@ impl Backend for Written {
                 for (name, tensor) in found.iter() {
                     let len = tensor.values.len() / fresh.len();
                     let values = tensor.values[row * len..(row + 1) * len].to_vec();
-                    own.insert(name.into(), StateTensor { shape: tensor.shape[1..].into(), values });
+                    own.insert(
+                        name.into(),
+                        StateTensor { shape: tensor.shape[1..].into(), values },
+                    );
                 }
                 self.frames.insert(frame.id, own);
             }
@@ -187,7 +190,8 @@ impl Backend for Written {
             self.base.tensor(stacked("head.feat", frames).values, [frames.len(), d, f, f])
         };
         let each = |part: fn(&TemplateFrame) -> &Vec<f32>| -> Vec<f32> {
-            let used = pass.sequences.iter().flat_map(|i| &sequences[*i].templates[..pass.templates]);
+            let used =
+                pass.sequences.iter().flat_map(|i| &sequences[*i].templates[..pass.templates]);
             used.flat_map(|t| part(t).iter().copied()).collect()
         };
         let count = templates.len();
@@ -280,10 +284,11 @@ impl Arranged {
     /// Maps of the training pass over all sequences at once; they replace those computed one by one.
     fn whole_batch(&self, sequences: &[Sequence], pass: &Pass, found: &mut StateDict) {
         let (base, f) = (&self.base, self.base.net.spec().map_side());
-        let [templates, search] =
-            frames(sequences, pass).map(|list| list.into_iter().map(|f| f.crop.as_slice()).collect());
+        let [templates, search] = frames(sequences, pass)
+            .map(|list| list.into_iter().map(|f| f.crop.as_slice()).collect());
         let each = |part: fn(&TemplateFrame) -> &Vec<f32>| -> Vec<f32> {
-            let used = pass.sequences.iter().flat_map(|i| &sequences[*i].templates[..pass.templates]);
+            let used =
+                pass.sequences.iter().flat_map(|i| &sequences[*i].templates[..pass.templates]);
             used.flat_map(|t| part(t).iter().copied()).collect()
         };
         let templates: Vec<&[f32]> = templates;

@@ -281,7 +281,11 @@ pub fn difference(got: &[f32], want: &[f32]) -> f32 {
     }
     got.iter().zip(want).fold(0.0, |max: f32, (a, b)| {
         let off = (a - b).abs();
-        if off.is_finite() || a == b { max.max(if a == b { 0.0 } else { off }) } else { f32::INFINITY }
+        if off.is_finite() || a == b {
+            max.max(if a == b { 0.0 } else { off })
+        } else {
+            f32::INFINITY
+        }
     })
 }
 

@@ -108,9 +108,9 @@ pub fn open(selection: &Selection) -> Result<Folder, GoldenError> {
             found: if found.is_empty() { "nothing".into() } else { found.join(", ") },
         });
     }
-    let has_embedding = weights.as_ref().is_none_or(|(_, dict)| {
-        dict.names().any(|n| n.ends_with("query_embed_test.weight"))
-    });
+    let has_embedding = weights
+        .as_ref()
+        .is_none_or(|(_, dict)| dict.names().any(|n| n.ends_with("query_embed_test.weight")));
     let cases = chosen
         .iter()
         .map(|path| case(path, selection, sequential, &read.sequences, has_embedding))
@@ -365,9 +365,7 @@ fn scoped(
     Ok(passes
         .into_iter()
         .rev()
-        .map(|((templates, mode), figures)| {
-            (Pass { mode, templates, sequences: vec![0] }, figures)
-        })
+        .map(|((templates, mode), figures)| (Pass { mode, templates, sequences: vec![0] }, figures))
         .collect())
 }
 

@@ -8,6 +8,8 @@ use burn::tensor::Tensor;
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use tsda_runtime::bundle::SectionKind;
+#[cfg(feature = "ort")]
+use tsda_runtime::engine::ort::graph::GraphSession;
 use tsda_trainer::model::TrackerNet;
 use tsda_trainer::model::inspect::{Mode, Parts};
 
@@ -17,11 +19,8 @@ pub trait Session {
     ///
     /// # Errors
     /// What the library said.
-    fn run(
-        &mut self,
-        inputs: &[(&str, &[f32])],
-        outputs: &[&str],
-    ) -> Result<Vec<Vec<f32>>, String>;
+    fn run(&mut self, inputs: &[(&str, &[f32])], outputs: &[&str])
+    -> Result<Vec<Vec<f32>>, String>;
 }
 
 /// Loads an ONNX file that holds its weights into a library.
@@ -126,11 +125,7 @@ impl Opened {
     }
 }
 
-fn open(
-    engine: &'static str,
-    load: Load,
-    graph: &Graph,
-) -> Result<Box<dyn Session>, GoldenError> {
+fn open(engine: &'static str, load: Load, graph: &Graph) -> Result<Box<dyn Session>, GoldenError> {
     load(&encode(graph, Storage::Inline)).map_err(|detail| GoldenError::Graph {
         engine,
         graph: graph.name.clone(),
@@ -246,42 +241,41 @@ pub fn tract(file: &[u8]) -> Result<Box<dyn Session>, String> {
     }
 }
 
+#[cfg(feature = "ort")]
+impl Session for GraphSession {
+    fn run(
+        &mut self,
+        inputs: &[(&str, &[f32])],
+        outputs: &[&str],
+    ) -> Result<Vec<Vec<f32>>, String> {
+        for (name, values) in inputs {
+            let input = self.input_mut(name).ok_or(format!("there is no input `{name}`"))?;
+            if input.len() != values.len() {
+                return Err(format!(
+                    "input `{name}` has {} numbers, {} were given",
+                    input.len(),
+                    values.len()
+                ));
+            }
+            input.copy_from_slice(values);
+        }
+        GraphSession::run(self).map_err(|e| e.to_string())?;
+        outputs
+            .iter()
+            .map(|name| match self.output(name) {
+                Some(values) => Ok(values.to_vec()),
+                None => Err(format!("there is no output `{name}`")),
+            })
+            .collect()
+    }
+}
+
 /// Loads a graph into ONNX Runtime.
 ///
 /// # Errors
 /// What it said.
 #[cfg(feature = "ort")]
 pub fn ort(file: &[u8]) -> Result<Box<dyn Session>, String> {
-    use tsda_runtime::engine::ort::graph::GraphSession;
-
-    impl Session for GraphSession {
-        fn run(
-            &mut self,
-            inputs: &[(&str, &[f32])],
-            outputs: &[&str],
-        ) -> Result<Vec<Vec<f32>>, String> {
-            for (name, values) in inputs {
-                let input = self.input_mut(name).ok_or(format!("there is no input `{name}`"))?;
-                if input.len() != values.len() {
-                    return Err(format!(
-                        "input `{name}` has {} numbers, {} were given",
-                        input.len(),
-                        values.len()
-                    ));
-                }
-                input.copy_from_slice(values);
-            }
-            GraphSession::run(self).map_err(|e| e.to_string())?;
-            outputs
-                .iter()
-                .map(|name| match self.output(name) {
-                    Some(values) => Ok(values.to_vec()),
-                    None => Err(format!("there is no output `{name}`")),
-                })
-                .collect()
-        }
-    }
-
     match GraphSession::new(file, 0) {
         Ok(session) => Ok(Box::new(session)),
         Err(e) => Err(e.to_string()),

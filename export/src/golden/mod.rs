@@ -115,7 +115,9 @@ pub fn run_without_reference(
         }
     }
     let mut report = Report::new(preset, &[]);
-    report.notes.push("no reference figures: compared with burn in the form it is written in".into());
+    report
+        .notes
+        .push("no reference figures: compared with burn in the form it is written in".into());
     let mut passes = Vec::new();
     for count in (1..=templates).rev() {
         for mode in [Mode::Parallel { annotated: 1 }, Mode::Single] {
@@ -240,12 +242,7 @@ fn compare(
     Ok(())
 }
 
-fn line(
-    case: &Case,
-    figure: &Figure,
-    engine: &'static str,
-    value: &import::StateTensor,
-) -> Line {
+fn line(case: &Case, figure: &Figure, engine: &'static str, value: &import::StateTensor) -> Line {
     let reference = &figure.reference;
     let peak = peak(&reference.values);
     let (off, detail) = match figure.place.part(value, &reference.shape) {

@@ -103,7 +103,11 @@ impl Report {
         if !self.notes.is_empty() {
             text.push('\n');
         }
-        let _ = writeln!(text, "| tensor | cases | largest value | tolerance | {} |", engines.join(" | "));
+        let _ = writeln!(
+            text,
+            "| tensor | cases | largest value | tolerance | {} |",
+            engines.join(" | ")
+        );
         let _ = writeln!(text, "|---|---|---|---|{}", "---|".repeat(engines.len()));
         for tensor in rows {
             let all = || self.lines.iter().filter(|l| l.engine != "recipe" && l.tensor == tensor);
@@ -166,7 +170,10 @@ impl fmt::Display for Report {
             }
         }
         for (case, name) in &self.not_computed {
-            writeln!(f, "{case}  {name}  not computed by the engines asked for; burn computes all")?;
+            writeln!(
+                f,
+                "{case}  {name}  not computed by the engines asked for; burn computes all"
+            )?;
         }
         for (case, count) in &self.training {
             writeln!(
@@ -249,7 +256,10 @@ mod tests {
         let mut report = Report::new("small", &[]);
         report.lines.extend([line("scores", "burn", 1e-6), line("scores", "tract", 2e-6)]);
         let section = report.markdown("small");
-        assert!(section.contains("| `scores` | 1 | 1.000e0 | 2.0e-5 | 1.0e-6 | 2.0e-6 |"), "{section}");
+        assert!(
+            section.contains("| `scores` | 1 | 1.000e0 | 2.0e-5 | 1.0e-6 | 2.0e-6 |"),
+            "{section}"
+        );
         let one = with_section("", "small", "first");
         let two = with_section(&one, "tomp101", "second");
         let three = with_section(&two, "small", "third");

@@ -6,8 +6,11 @@ mod devices;
 #[cfg(feature = "eval")]
 mod eval;
 mod info;
+mod replay;
 mod track;
 mod verify;
+
+pub use replay::ReplayArgs;
 
 use crate::error::HostError;
 use clap::{Args, Parser, Subcommand};
@@ -41,6 +44,8 @@ pub enum Command {
     Info(InfoArgs),
     /// Check every engine of this build against the reference outputs stored in the bundle
     Verify(VerifyArgs),
+    /// Replay scripted runs through the tracker and compare every frame
+    Replay(ReplayArgs),
     /// Evaluate a bundle on a dataset under cross-modal protocols
     #[cfg(feature = "eval")]
     Eval(EvalArgs),
@@ -165,6 +170,7 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Track(args) => track::run(args),
         Command::Info(args) => info::run(args),
         Command::Verify(args) => verify::run(args),
+        Command::Replay(args) => replay::run(args),
         #[cfg(feature = "eval")]
         Command::Eval(args) => eval::run(args),
         #[cfg(feature = "camera")]

@@ -122,6 +122,23 @@ impl BoxRegressor {
 }
 
 impl TowerLayer {
+    /// The one-group norm of a map `(B, d, H, W)`. Means are taken channel by channel first: engines
+    /// add one axis from end to end, and 80,000 numbers in a row would cost a decimal place.
+    fn norm(&self, x: Tensor<4>) -> Tensor<4> {
+        let [b, d, h, w] = x.dims();
+        let x = x.reshape([b, d, h * w]);
+        let x = x.clone() - x.mean_dim(2).mean_dim(1);
+        let variance = x.clone().powi_scalar(2).mean_dim(2).mean_dim(1);
+        let x = x * variance.add_scalar(self.norm.epsilon).sqrt().recip();
+        let x = match (&self.norm.gamma, &self.norm.beta) {
+            (Some(gamma), Some(beta)) => {
+                x * gamma.val().reshape([1, d, 1]) + beta.val().reshape([1, d, 1])
+            }
+            _ => x,
+        };
+        x.reshape([b, d, h, w])
+    }
+
     /// The one-group norm of a batch-wide map `(d, N, H * W)`.
     fn norm_wide(&self, x: Tensor<3>) -> Tensor<3> {
         let d = x.dims()[0];
@@ -303,10 +320,7 @@ impl Head {
             return regressor.distances_wide(x.permute([2, 0, 1]).reshape([d, b, side, side]));
         }
         let x = x.swap_dims(1, 2).reshape([b, d, side, side]);
-        let x = regressor
-            .tower
-            .iter()
-            .fold(x, |x, layer| relu(layer.norm.forward(layer.conv.forward(x))));
+        let x = regressor.tower.iter().fold(x, |x, layer| relu(layer.norm(layer.conv.forward(x))));
         regressor.bbreg_layer.forward(x).exp()
     }
 }

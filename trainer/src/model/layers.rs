@@ -234,8 +234,10 @@ pub(crate) fn instance_l2_norm(x: Tensor<4>, filter_size: usize) -> Tensor<4> {
     let [b, c, h, w] = x.dims();
     let count = c * h * w;
     let scale = (1.0 / (c * filter_size * filter_size) as f64).sqrt();
-    let flat = x.reshape([b, count]);
-    let energy = flat.clone().powi_scalar(2).sum_dim(1).add_scalar(1e-5);
+    let flat = x.reshape([b, c, h * w]);
+    // Channel by channel: engines add one axis from end to end, and 80,000 numbers in a row would
+    // cost a decimal place of the whole feature.
+    let energy = flat.clone().powi_scalar(2).sum_dim(2).sum_dim(1).add_scalar(1e-5);
     // s * sqrt(n / e), written with one square root and one division.
     let factor = energy.sqrt().recip().mul_scalar(scale * (count as f64).sqrt());
     (flat * factor).reshape([b, c, h, w])

@@ -46,7 +46,8 @@ impl Head {
         keep(&mut found, "encoder.pos", position.clone().swap_dims(0, 1));
         let mask = match mode {
             Mode::Parallel { annotated } => {
-                let hidden = |i: usize| i >= l && (annotated * cells..count * cells).contains(&(i - l));
+                let hidden =
+                    |i: usize| i >= l && (annotated * cells..count * cells).contains(&(i - l));
                 let flags = (0..2 * l).map(|i| f32::from(u8::from(hidden(i)))).collect::<Vec<_>>();
                 let data = TensorData::new(flags.clone(), [2, l]);
                 keep(&mut found, "encoder.key_padding_mask", Tensor::<2>::from_data(data, &device));
@@ -83,7 +84,8 @@ impl Head {
         let map = encoded.clone().swap_dims(1, 2).reshape([b, d, f, f]);
         keep(found, &format!("{which}_filter"), filter.clone().reshape([b, d, 1, 1]));
         keep(found, &format!("{which}_enc"), map.clone().unsqueeze_dim::<5>(0));
-        let linear = if which == "cls" { &self.classifier.linear } else { &self.bb_regressor.linear };
+        let linear =
+            if which == "cls" { &self.classifier.linear } else { &self.bb_regressor.linear };
         let weights = linear.forward(filter);
         keep(found, &format!("{which}.filter_proj"), weights.clone());
         let attention = encoded.matmul(weights.reshape([b, d, 1])).reshape([b, 1, cells]);
@@ -93,9 +95,8 @@ impl Head {
             return;
         }
         let tower = &self.bb_regressor.tower;
-        let x = tower
-            .iter()
-            .fold(map * attention, |x, layer| relu(layer.norm.forward(layer.conv.forward(x))));
+        let x =
+            tower.iter().fold(map * attention, |x, layer| relu(layer.norm(layer.conv.forward(x))));
         keep(found, "reg.tower", x.clone());
         let x = self.bb_regressor.bbreg_layer.forward(x);
         keep(found, "reg.pre_exp", x.clone());

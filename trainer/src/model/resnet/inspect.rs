@@ -12,10 +12,9 @@ use burn::tensor::ops::MaxPoolOptions;
 fn norm(bn: &FrozenBatchNorm, x: Tensor<4>) -> Tensor<4> {
     let c = x.dims()[1];
     let per_channel = |t: Tensor<1>| t.reshape([1, c, 1, 1]);
-    let deviation = bn.running_var.val().add_scalar(EPSILON).sqrt();
-    (x - per_channel(bn.running_mean.val())) / per_channel(deviation)
-        * per_channel(bn.weight.val())
-        + per_channel(bn.bias.val())
+    let scale = bn.weight.val() / bn.running_var.val().add_scalar(EPSILON).sqrt();
+    let shift = bn.bias.val() - bn.running_mean.val() * scale.clone();
+    x * per_channel(scale) + per_channel(shift)
 }
 
 fn step(conv: &Conv, bn: &FrozenBatchNorm, x: Tensor<4>) -> Tensor<4> {
