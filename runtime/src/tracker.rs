@@ -332,6 +332,4 @@ fn fits(
 }
 
 #[cfg(test)]
-mod replay;
-#[cfg(test)]
 mod tests;

@@ -42,12 +42,14 @@ impl Tolerance {
     }
 }
 
-/// Scores, boxes, filters, encoder output and everything inside the transformer.
+/// Scores, filters, encoder output and everything inside the transformer.
 const HEAD: Tolerance = Tolerance::Absolute(2e-5);
 /// Head feature after its norm.
 const FEATURE: Tolerance = Tolerance::Absolute(1e-6);
 /// Maps whose size depends on the weights.
 const MAP: Tolerance = Tolerance::Relative { share: 2e-6, at_least: 0.0 };
+/// Distances: exponentials, so rounding grows with the value where it is above 1.
+const BOXES: Tolerance = Tolerance::Relative { share: 2e-5, at_least: 1.0 };
 /// Values of the box tower and before its exponential.
 const TOWER: Tolerance = Tolerance::Relative { share: 2e-5, at_least: 1.0 };
 /// Positional code: sines of single-precision angles.
@@ -228,9 +230,10 @@ fn canonical(base: &str) -> (String, Option<usize>) {
 /// The tolerance of a known value; nothing for a name that is none.
 fn tolerance(key: &str, spec: &ModelSpec) -> Option<Tolerance> {
     let known = match key {
-        "scores" | "ltrb" | "cls_filter" | "reg_filter" | "cls_enc" | "reg_enc"
-        | "cls.filter_proj" | "reg.filter_proj" | "enc.ltrb_mlp" | "encoder.input"
-        | "encoder.last" | "decoder.norm" => HEAD,
+        "ltrb" => BOXES,
+        "scores" | "cls_filter" | "reg_filter" | "cls_enc" | "reg_enc" | "cls.filter_proj"
+        | "reg.filter_proj" | "enc.ltrb_mlp" | "encoder.input" | "encoder.last"
+        | "decoder.norm" => HEAD,
         "reg.tower" | "reg.pre_exp" => TOWER,
         "encoder.pos" => CODE,
         "encoder.key_padding_mask" => EXACT,

@@ -22,10 +22,8 @@ pub struct ReplayArgs {
 pub(super) fn run(args: &ReplayArgs) -> Result<u8, HostError> {
     let report = replay::replay(&args.script, args.tensors.as_deref())?;
     if args.json {
-        let text = serde_json::to_string_pretty(&report).map_err(|e| HostError::Encode {
-            path: args.script.clone(),
-            reason: e.to_string(),
-        })?;
+        let text = serde_json::to_string_pretty(&report)
+            .map_err(|e| HostError::Encode { path: args.script.clone(), reason: e.to_string() })?;
         println!("{text}");
     } else {
         print!("{report}");

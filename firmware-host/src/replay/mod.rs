@@ -51,6 +51,15 @@ pub fn replay(script: &Path, maps: Option<&Path>) -> Result<Report, ReplayError>
         column: e.column(),
         detail: e.to_string(),
     })?;
+    if value.get(0).is_some_and(|case| case.get("pixels_at_yxc").is_some()) {
+        return Err(ReplayError::Field {
+            path: script.into(),
+            at: "the list".into(),
+            detail: "these are training crops, which the trainer cuts: `cargo test -p \
+                     tsda-trainer crop` compares them"
+                .into(),
+        });
+    }
     if patches::is_list(&value) {
         return patches::replay(&value, script);
     }

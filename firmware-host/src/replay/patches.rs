@@ -11,7 +11,8 @@ use tsda_runtime::crop::{self, Border, CropError, Window};
 use tsda_runtime::{FrameView, ModelSpec, Yx, probe};
 
 /// Known fields that are not compared: the window's inside, which the pixels give away.
-const INSIDE: [&str; 4] = ["downsampled_src_hw", "pad_left_right_top_bottom", "patch_hw", "resized"];
+const INSIDE: [&str; 4] =
+    ["downsampled_src_hw", "pad_left_right_top_bottom", "patch_hw", "resized"];
 
 /// Whether a file is such a list.
 pub(super) fn is_list(value: &Value) -> bool {
@@ -90,13 +91,21 @@ fn one(
     let want = f.numbers("patch_coord_y1x1y2x2")?;
     let corners = [p.tl.y, p.tl.x, p.br.y, p.br.x];
     let quantity = "position (px)";
-    compare.numbers(quantity, "patch_coord_y1x1y2x2", &corners, want.as_deref(), POSITION_TOLERANCE);
+    compare.numbers(
+        quantity,
+        "patch_coord_y1x1y2x2",
+        &corners,
+        want.as_deref(),
+        POSITION_TOLERANCE,
+    );
     let mut got = Vec::new();
     for at in f.list("pixels_at")?.into_iter().flatten() {
         let place: Option<Vec<usize>> =
             at.as_array().and_then(|a| a.iter().map(|n| n.as_u64().map(|n| n as usize)).collect());
         let index = match place.as_deref() {
-            Some(&[c, row, col]) if c < 3 && row < side && col < side => (c * side + row) * side + col,
+            Some(&[c, row, col]) if c < 3 && row < side && col < side => {
+                (c * side + row) * side + col
+            }
             _ => return Err(f.wrong("pixels_at", format!("{at} is no [channel, row, column]"))),
         };
         got.push(out[index]);

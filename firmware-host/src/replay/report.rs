@@ -44,7 +44,7 @@ pub struct Report {
     pub runs: Vec<RunReport>,
     /// Fields and tensors this version does not know.
     pub unknown: BTreeSet<String>,
-    /// Fields that are known, but have no counterpart in this tracker.
+    /// Fields that are known, but have no counterpart to be compared with.
     pub not_compared: BTreeSet<&'static str>,
 }
 
@@ -133,14 +133,18 @@ fn distance(a: f64, b: f64) -> f64 {
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for v in self.violations() {
-            write!(f, "run {}, frame {}, {}: expected {}, got {}", v.run, v.frame, v.field, v.expected, v.got)?;
+            write!(
+                f,
+                "run {}, frame {}, {}: expected {}, got {}",
+                v.run, v.frame, v.field, v.expected, v.got
+            )?;
             match v.difference {
                 Some((off, allowed)) => writeln!(f, " (off by {off:.3e}, allowed {allowed:.1e})")?,
                 None => writeln!(f)?,
             }
         }
         for field in &self.not_compared {
-            writeln!(f, "{field}: not compared, this tracker has no such thing")?;
+            writeln!(f, "{field}: known, not compared")?;
         }
         for field in &self.unknown {
             writeln!(f, "{field}: unknown, not compared")?;

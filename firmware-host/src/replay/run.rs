@@ -6,7 +6,9 @@ use super::fields::Fields;
 use super::report::{Comparer, Report, RunReport};
 use super::script::{Picture, Run, Script};
 use super::tensors::{Tensor, Tensors};
-use super::{GREY_TOLERANCE, LABEL_TOLERANCE, POSITION_TOLERANCE, SCALE_TOLERANCE, SCORE_TOLERANCE};
+use super::{
+    GREY_TOLERANCE, LABEL_TOLERANCE, POSITION_TOLERANCE, SCALE_TOLERANCE, SCORE_TOLERANCE,
+};
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -93,14 +95,19 @@ impl Player<'_> {
     }
 
     /// Score map and distances of a frame.
-    fn answer(&mut self, frame: u64, spec: &ModelSpec) -> Result<(Vec<f32>, Vec<f32>), ReplayError> {
+    fn answer(
+        &mut self,
+        frame: u64,
+        spec: &ModelSpec,
+    ) -> Result<(Vec<f32>, Vec<f32>), ReplayError> {
         let (run, f, cells) = (self.run.name.clone(), spec.map_side(), spec.cells());
         let mut read = |kind: &str, count: usize| {
             let map = self.map(frame, kind)?;
             if map.values.len() == count {
                 return Ok(map.values.clone());
             }
-            let detail = format!("shape {:?}, expected {count} numbers for maps of {f} x {f}", map.shape);
+            let detail =
+                format!("shape {:?}, expected {count} numbers for maps of {f} x {f}", map.shape);
             Err(self.wrong_tensor(&format!("{run}.f{frame}.{kind}"), detail))
         };
         Ok((read("scores", cells)?, read("ltrb", 4 * cells)?))
@@ -119,8 +126,7 @@ impl Player<'_> {
             let run = run.name.clone();
             move |source| ReplayError::Tracker { run, frame, source: Box::new(source) }
         };
-        let mut tracker =
-            Tracker::new(Scripted::new(spec), run.params).map_err(failed(0))?;
+        let mut tracker = Tracker::new(Scripted::new(spec), run.params).map_err(failed(0))?;
         let mut report = RunReport { name: run.name.clone(), ..RunReport::default() };
         let mut bytes = vec![0; run.width * run.height * 3];
 
@@ -206,6 +212,7 @@ impl Player<'_> {
         let filled = tracker.memory().filled() as u64;
         compare.exact("num_gth_frames", filled, f.whole("num_gth_frames")?);
         self.compare_label(tracker, &mut f, compare)?;
+        self.compare_whole_label(tracker, "init_label", compare);
         self.compare_patch(tracker, &mut f, compare)?;
         f.ignore(&["note"]);
         self.leave(f, "init");
@@ -221,9 +228,31 @@ impl Player<'_> {
     ) -> Result<(), ReplayError> {
         let (max, at) = tracker.engine().label_peak();
         let want = f.number("label_max")?;
-        compare.numbers("label", "label_max", &[max], want.as_ref().map(std::slice::from_ref), LABEL_TOLERANCE);
+        compare.numbers(
+            "label",
+            "label_max",
+            &[max],
+            want.as_ref().map(std::slice::from_ref),
+            LABEL_TOLERANCE,
+        );
         compare.exact("label_argmax", at as u64, f.whole("label_argmax")?);
         Ok(())
+    }
+
+    /// The same, cell by cell, where the tensors have it.
+    fn compare_whole_label(
+        &mut self,
+        tracker: &Tracker<Scripted>,
+        what: &str,
+        compare: &mut Comparer<'_>,
+    ) {
+        let name = format!("{}.{what}", self.run.name);
+        if let Some(label) = self.tensors.get(&name) {
+            let want: Vec<f64> = label.values.iter().map(|v| f64::from(*v)).collect();
+            let got = &tracker.engine().label;
+            compare.numbers("label", what, got, Some(&want), LABEL_TOLERANCE);
+            self.used.insert(name);
+        }
     }
 
     /// Pixels and mean of the crop the network got.
@@ -245,7 +274,8 @@ impl Player<'_> {
                     numbers.collect::<Option<Vec<_>>>()?.try_into().ok()
                 };
                 let places: Option<Vec<_>> = list.iter().map(place).collect();
-                let wrong = || f.wrong("patch_samples_at", "expected [[channel, row, column], ..]".into());
+                let wrong =
+                    || f.wrong("patch_samples_at", "expected [[channel, row, column], ..]".into());
                 places.ok_or_else(wrong)?
             }
         };
@@ -333,12 +363,7 @@ impl Player<'_> {
             // The reference counts every write.
             compare.exact("memory.num_stored", after.stored, m.whole("num_stored")?);
             self.compare_label(tracker, &mut m, compare)?;
-            let name = format!("{}.f{}.new_label", self.run.name, after.frame);
-            if let Some(label) = self.tensors.get(&name) {
-                let want: Vec<f64> = label.values.iter().map(|v| f64::from(*v)).collect();
-                compare.numbers("label", "new_label", &engine.label, Some(&want), LABEL_TOLERANCE);
-                self.used.insert(name);
-            }
+            self.compare_whole_label(tracker, &format!("f{}.new_label", after.frame), compare);
         } else {
             // Compared in vain above; these are known all the same.
             m.ignore(&["target_box_xywh", "slots_hold_frame", "num_stored"]);
