@@ -7,12 +7,12 @@ use crate::onnx::ExportError;
 use burn::tensor::Device;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
-use tsda_runtime::SpecError;
 use tsda_runtime::bundle::{Figure, Manifest, Provenance, SectionKind, TrainedOn, crc32};
 use tsda_runtime::probe::{self, ProbeError};
+use tsda_runtime::{ModelSpec, SpecError, TrackerParams};
 use tsda_trainer::burn_engine::BurnEngine;
 use tsda_trainer::config::{ConfigError, Experiment};
-use tsda_trainer::import::{WeightsError, load_weights};
+use tsda_trainer::import::{self, Given, Metadata, Source, WeightsError, WeightsFile};
 use tsda_trainer::model::{NetOptions, TrackerNet};
 
 /// Most figures a manifest holds.
@@ -23,8 +23,11 @@ const MAX_FIGURES: usize = 32;
 pub struct BuildOptions {
     /// Trained weights, safetensors with state-dict names.
     pub weights: PathBuf,
-    /// The resolved configuration of the training run.
-    pub config: PathBuf,
+    /// The resolved configuration of the training run. Without one the network is the one the
+    /// weights say they are of, as imported ones do.
+    pub config: Option<PathBuf>,
+    /// Preset the network has to be of, when there is no configuration.
+    pub preset: Option<String>,
     /// The bundle to write.
     pub out: PathBuf,
     /// Name of the model; the file name of `out` when not given.
@@ -37,6 +40,8 @@ pub struct BuildOptions {
     pub data_sources: Option<PathBuf>,
     /// Licence of the weights.
     pub licence: String,
+    /// Sensors the weights have seen, when no configuration tells.
+    pub trained_on: TrainedOn,
 }
 
 /// A bundle that could not be built. Nothing has been written then.
@@ -57,6 +62,15 @@ pub enum BuildError {
     /// The weights cannot be used.
     #[error(transparent)]
     Weights(#[from] WeightsError),
+    /// Nothing says which network the weights are of.
+    #[error(
+        "the weights do not say which network they are of; give --config or --preset, or import \
+         them first with `tsda-train weights-import` ({})", path.display()
+    )]
+    NoSpec {
+        /// The weights file.
+        path: PathBuf,
+    },
     /// The weights hold a number that is not finite.
     #[error("tensor {tensor} holds {value} at element {index}; train again ({})", path.display())]
     NotFinite {
@@ -104,32 +118,114 @@ pub struct BuildReport {
     pub bundle: u64,
 }
 
-/// Builds a bundle: reads weights and configuration, records the graphs, computes the reference
-/// outputs with the network itself, writes the file.
+/// Which network to build, and what is known about how it was made.
+struct Plan {
+    spec: ModelSpec,
+    tracker: TrackerParams,
+    /// TOML.
+    config: String,
+    /// Program, or the file the weights were imported from.
+    trainer: String,
+    trained_on: TrainedOn,
+    seed: u64,
+    steps: u64,
+}
+
+impl Plan {
+    /// From a configuration: of a training run here.
+    fn configured(path: &Path, stored: Option<&ModelSpec>) -> Result<Self, BuildError> {
+        let text = files::read_text(path)?;
+        // Parsed, not loaded, which would look for the data sources on this machine.
+        let experiment = portable(Experiment::parse(&text, path)?);
+        let spec = experiment
+            .model_spec()
+            .map_err(|source| BuildError::Spec { path: path.into(), source })?;
+        if let Some(stored) = stored {
+            import::check_hidden(stored, &spec, &path.display().to_string())?;
+        }
+        // Every data source the trainer reads is a registered RGB-thermal one.
+        let both = !experiment.data.is_empty();
+        Ok(Self {
+            spec,
+            tracker: experiment.tracker,
+            config: experiment.to_toml()?,
+            trainer: concat!("tsda-train ", env!("CARGO_PKG_VERSION")).into(),
+            trained_on: TrainedOn {
+                rgb: both,
+                thermal: both,
+                cross_modal: experiment.sampler.cross_modal_p > 0.0,
+            },
+            seed: experiment.run.seed,
+            steps: experiment.total_steps(),
+        })
+    }
+
+    /// From what the weights say, with the thresholds of spec 3.1.
+    fn stored(options: &BuildOptions, file: &WeightsFile) -> Result<Self, BuildError> {
+        let stored = file.metadata.spec.as_ref();
+        let given = match &options.preset {
+            Some(name) => Given::Preset(name.clone()),
+            None if stored.is_some() => Given::Nothing,
+            None => return Err(BuildError::NoSpec { path: options.weights.clone() }),
+        };
+        let spec = import::infer(&file.dict, None, stored, &given)?.spec;
+        let tracker = TrackerParams::default();
+        let from = |s: &Source| match s.constructor.as_str() {
+            "" => format!("imported from {} ({})", s.file, s.kind),
+            call => format!("imported from {} ({}, {call})", s.file, s.kind),
+        };
+        Ok(Self {
+            spec,
+            tracker,
+            config: import::model_toml(&spec, &tracker)?,
+            trainer: file.metadata.source.as_ref().map_or_else(|| "not known".into(), from),
+            trained_on: options.trained_on,
+            seed: 0,
+            steps: 0,
+        })
+    }
+}
+
+/// Builds a bundle: reads weights and what is known about them, records the graphs, computes the
+/// reference outputs with the network itself, writes the file.
 ///
 /// # Errors
 /// Names the file, field or tensor that cannot be used. No file is left behind then.
 pub fn build(options: &BuildOptions) -> Result<BuildReport, BuildError> {
-    let text = files::read_text(&options.config)?;
-    // Parsed, not loaded, which would look for the data sources on this machine.
-    let experiment = portable(Experiment::parse(&text, &options.config)?);
-    let spec = experiment
-        .model_spec()
-        .map_err(|source| BuildError::Spec { path: options.config.clone(), source })?;
-    let config = experiment.to_toml()?;
+    let weights_path = options.weights.as_path();
+    // Settings before weights: they are read in no time, and most mistakes are in them.
+    let configured = match &options.config {
+        None => None,
+        Some(path) => {
+            let stored = Metadata::read(weights_path).ok().and_then(|m| m.spec);
+            Some(Plan::configured(path, stored.as_ref())?)
+        }
+    };
     let read = |path: &Option<PathBuf>| path.as_deref().map(files::read_text).transpose();
     let (card, data) = (read(&options.card)?, read(&options.data_sources)?.unwrap_or_default());
     let figures = options.figures.as_deref().map(read_figures).transpose()?.unwrap_or_default();
 
+    let file = WeightsFile::read(weights_path)?;
+    let plan = match configured {
+        Some(plan) => plan,
+        None => Plan::stored(options, &file)?,
+    };
+    let spec = plan.spec;
+    let spec_path = options.config.as_deref().unwrap_or(weights_path);
     let net = TrackerNet::new(&spec, &NetOptions::default(), &Device::flex())
-        .map_err(|source| BuildError::Spec { path: options.config.clone(), source })?;
-    let (net, _) = load_weights(net, &options.weights)?;
-    check_finite(&net, &options.weights)?;
-    let raw = std::fs::read(&options.weights).map_err(|source| FileError {
-        action: "read",
-        path: options.weights.clone(),
-        source,
-    })?;
+        .map_err(|source| BuildError::Spec { path: spec_path.into(), source })?;
+    let tensors = |source| WeightsError::Tensors { source, path: weights_path.into() };
+    let (net, _) = import::apply(net, &file.dict, "").map_err(tensors)?;
+    drop(file);
+    check_finite(&net, weights_path)?;
+    let weights_crc = {
+        let raw = std::fs::read(weights_path).map_err(|source| FileError {
+            action: "read",
+            path: weights_path.into(),
+            source,
+        })?;
+        crc32(&raw)
+    };
 
     let graphs = network::graphs(&net)?;
     let mut sections = network::files(&graphs);
@@ -142,21 +238,16 @@ pub fn build(options: &BuildOptions) -> Result<BuildReport, BuildError> {
     let manifest = Manifest {
         name: &name,
         spec,
-        tracker: experiment.tracker,
-        trained_on: TrainedOn {
-            // Every data source the trainer reads is a registered RGB-thermal one.
-            rgb: !experiment.data.is_empty(),
-            thermal: !experiment.data.is_empty(),
-            cross_modal: experiment.sampler.cross_modal_p > 0.0,
-        },
+        tracker: plan.tracker,
+        trained_on: plan.trained_on,
         calibration: None,
         provenance: Provenance {
-            trainer: concat!("tsda-train ", env!("CARGO_PKG_VERSION")),
-            config: &config,
-            seed: experiment.run.seed,
-            steps: experiment.total_steps(),
+            trainer: &plan.trainer,
+            config: &plan.config,
+            seed: plan.seed,
+            steps: plan.steps,
             data: &data,
-            weights_crc: crc32(&raw),
+            weights_crc,
         },
         figures: figures.iter().map(|(name, value)| Figure { name, value: *value }).collect(),
         licence: &options.licence,

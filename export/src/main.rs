@@ -7,7 +7,7 @@
 mod golden;
 
 use anyhow::Context as _;
-use clap::{Parser, Subcommand};
+use clap::{Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use tsda_export::build::{BuildOptions, build};
@@ -16,7 +16,7 @@ use tsda_export::macs::{self, MacsReport};
 use tsda_export::network;
 use tsda_export::unpack::unpack;
 use tsda_runtime::ModelSpec;
-use tsda_runtime::bundle::BundleFile;
+use tsda_runtime::bundle::{BundleFile, TrainedOn};
 
 /// Turns trained weights into bundles that run on a board, and checks them.
 #[derive(Parser)]
@@ -28,14 +28,21 @@ struct Args {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Writes a bundle from trained weights and the configuration they were trained with.
+    /// Writes a bundle from trained or imported weights.
     Build {
-        /// Weights (safetensors), as `tsda-train fit` writes them.
+        /// Weights (safetensors), as `tsda-train fit` and `tsda-train weights-import` write them.
         #[arg(long)]
         weights: PathBuf,
-        /// The resolved configuration beside the weights (TOML).
+        /// The resolved configuration beside trained weights (TOML). Imported weights need none:
+        /// they say which network they are of.
         #[arg(long)]
-        config: PathBuf,
+        config: Option<PathBuf>,
+        /// The network the weights have to be of: "tomp101", "tomp50" or "nano".
+        #[arg(long, conflicts_with = "config")]
+        preset: Option<String>,
+        /// Sensors imported weights have seen: "rgb", "thermal", "cross-modal", separated by commas.
+        #[arg(long, value_delimiter = ',', conflicts_with = "config")]
+        trained_on: Vec<Sensor>,
         /// The bundle to write.
         #[arg(long)]
         out: PathBuf,
@@ -93,6 +100,16 @@ struct Counted {
     preset: Option<String>,
 }
 
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Sensor {
+    /// Visible light.
+    Rgb,
+    /// Long-wave infrared.
+    Thermal,
+    /// Templates of one sensor against searches of the other.
+    CrossModal,
+}
+
 fn tolerance(text: &str) -> Result<f32, String> {
     match text.parse::<f32>() {
         Ok(v) if v.is_finite() && v >= 0.0 => Ok(v),
@@ -112,9 +129,35 @@ fn main() -> ExitCode {
 
 fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
-        Command::Build { weights, config, out, name, card, figures, data_sources, licence } => {
-            let options =
-                BuildOptions { weights, config, out, name, card, figures, data_sources, licence };
+        Command::Build {
+            weights,
+            config,
+            preset,
+            trained_on,
+            out,
+            name,
+            card,
+            figures,
+            data_sources,
+            licence,
+        } => {
+            let trained_on = TrainedOn {
+                rgb: trained_on.contains(&Sensor::Rgb),
+                thermal: trained_on.contains(&Sensor::Thermal),
+                cross_modal: trained_on.contains(&Sensor::CrossModal),
+            };
+            let options = BuildOptions {
+                weights,
+                config,
+                preset,
+                out,
+                name,
+                card,
+                figures,
+                data_sources,
+                licence,
+                trained_on,
+            };
             let report = build(&options)?;
             for (kind, recorded, written) in &report.graphs {
                 println!(

@@ -104,13 +104,15 @@ fn inputs(dir: &Path, spec: &ModelSpec) -> BuildOptions {
     std::fs::write(dir.join("d.txt"), "somewhere (CC0)\n").unwrap();
     BuildOptions {
         weights: dir.join("w.safetensors"),
-        config: dir.join("c.toml"),
+        config: Some(dir.join("c.toml")),
+        preset: None,
         out: dir.join("small.tsda"),
         name: None,
         card: Some(dir.join("card.md")),
         figures: Some(dir.join("f.json")),
         data_sources: Some(dir.join("d.txt")),
         licence: "CC0-1.0".into(),
+        trained_on: TrainedOn::default(),
     }
 }
 
@@ -246,7 +248,7 @@ fn bad_input_is_named_and_leaves_no_file() {
             "unknown key",
             Box::new(|o| {
                 let text = config().replace("steps = 7", "stpes = 7");
-                o.config = put("typo.toml", text.as_bytes());
+                o.config = Some(put("typo.toml", text.as_bytes()));
             }),
             vec!["typo.toml", "stpes", "line"],
         ),
@@ -254,7 +256,7 @@ fn bad_input_is_named_and_leaves_no_file() {
             "number out of range",
             Box::new(|o| {
                 let text = config().replace("crop = 96", "crop = 95");
-                o.config = put("range.toml", text.as_bytes());
+                o.config = Some(put("range.toml", text.as_bytes()));
             }),
             vec!["range.toml", "crop", "95"],
         ),
@@ -279,7 +281,8 @@ fn bad_input_is_named_and_leaves_no_file() {
         change(&mut options);
         let mut command = tool();
         command.arg("build");
-        command.arg("--weights").arg(&options.weights).arg("--config").arg(&options.config);
+        command.arg("--weights").arg(&options.weights);
+        command.arg("--config").arg(options.config.as_ref().unwrap());
         command.arg("--out").arg(&options.out);
         command.arg("--card").arg(options.card.as_ref().unwrap());
         command.arg("--figures").arg(options.figures.as_ref().unwrap());

@@ -93,13 +93,15 @@ fn pairs_are_trained_on_exported_and_tracked() {
     let out = at("road.tsda");
     build(&BuildOptions {
         weights: model,
-        config: at("out/config.resolved.toml"),
+        config: Some(at("out/config.resolved.toml")),
+        preset: None,
         out: out.clone(),
         name: None,
         card: None,
         figures: None,
         data_sources: None,
         licence: "none".into(),
+        trained_on: Default::default(),
     })
     .unwrap();
     let file = BundleFile::open(&out).unwrap();

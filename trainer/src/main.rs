@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use tsda_trainer::config::Experiment;
 use tsda_trainer::fit::{self, FitOptions, Outcome};
-use tsda_trainer::import::{self, ImportKind};
+use tsda_trainer::import::{self, ImportKind, ImportOptions};
 use tsda_trainer::processing::contact_sheet;
 
 /// Trains cross-modal trackers.
@@ -74,16 +74,21 @@ enum DeviceName {
 
 #[derive(clap::Args)]
 struct ImportArgs {
-    /// What the input holds: "efficientnet-lite0" (backbone) or "full" (a whole network).
+    /// What the input holds: "pytracking" (a ToMP checkpoint), "torchvision-resnet" or
+    /// "efficientnet-lite0" (backbones), "full" (a whole network). Found out when not given.
     #[arg(long)]
-    kind: String,
-    /// File to read.
+    kind: Option<ImportKind>,
+    /// File to read: PyTorch (zip or legacy) or safetensors.
     #[arg(long)]
     input: PathBuf,
-    /// File to write.
+    /// File to write: safetensors that say which network they are of.
     #[arg(long)]
     out: PathBuf,
-    /// The experiment whose [model] the weights are for; the nano preset without one.
+    /// The network the weights have to be of: "tomp101", "tomp50" or "nano". Found out when not
+    /// given; filter size and test-frame embedding always are the file's.
+    #[arg(long, conflicts_with = "config")]
+    preset: Option<String>,
+    /// The experiment whose [model] the weights have to be of.
     #[arg(long)]
     config: Option<PathBuf>,
 }
@@ -197,18 +202,17 @@ fn stop_on_signal() -> Result<Arc<AtomicBool>> {
 }
 
 fn run_import(args: &ImportArgs) -> Result<()> {
-    let kind: ImportKind = args.kind.parse().map_err(|e: String| anyhow::anyhow!("--kind: {e}"))?;
-    let spec = match &args.config {
-        Some(path) => Experiment::load(path)?.model_spec()?,
-        None => tsda_runtime::ModelSpec::NANO,
-    };
-    let report = import::run(kind, &args.input, &args.out, &spec)?;
-    println!(
-        "{}: {} tensors taken, {} not needed",
-        args.out.display(),
-        report.loaded.len(),
-        report.unused.len()
-    );
+    let summary = import::run(&ImportOptions {
+        kind: args.kind,
+        input: args.input.clone(),
+        output: args.out.clone(),
+        given: import::given(args.preset.as_deref(), args.config.as_deref())?,
+    })?;
+    println!("{summary}");
+    if summary.network.is_some() {
+        let out = args.out.display();
+        println!("next         tsda-export build --weights {out} --out MODEL.tsda");
+    }
     Ok(())
 }
 

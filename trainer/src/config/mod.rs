@@ -301,9 +301,11 @@ impl Default for OptimConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InitConfig {
-    /// Backbone weights (`.safetensors`), or `"scratch"` for random ones.
+    /// Backbone weights (safetensors, or a PyTorch file as torchvision's), or `"scratch"` for random
+    /// ones.
     pub backbone: String,
-    /// Weights of a whole network of the same specification to go on from; empty for none.
+    /// Weights of a whole network of the same specification to go on from (safetensors, or a
+    /// pytracking checkpoint); empty for none.
     pub weights: String,
 }
 

@@ -8,6 +8,8 @@ mod evaluate;
 mod optim;
 mod progress;
 mod state;
+#[cfg(test)]
+mod step_tests;
 mod tensors;
 
 pub use evaluate::{Group, Validation, best_box};
@@ -64,9 +66,9 @@ pub enum FitError {
     Weights(#[from] WeightsError),
     /// A weights file of the configuration does not exist.
     #[error(
-        "{field}: {path} does not exist; fetch the ImageNet weights with `python3 \
-         trainer/scripts/fetch_efficientnet_lite0.py` and give their path, or train from random \
-         weights with init.backbone = \"scratch\""
+        "{field}: {path} does not exist; fetch the ImageNet weights (EfficientNet-Lite0: `python3 \
+         trainer/scripts/fetch_efficientnet_lite0.py`; ResNet: torchvision's .pth file) and give \
+         their path, or train from random weights with init.backbone = \"scratch\""
     )]
     NoWeights {
         /// Field of the configuration.
@@ -459,6 +461,7 @@ fn train_step(
     let cls = f64::from(l.classification.into_scalar::<f32>());
     let giou = f64::from(l.giou.into_scalar::<f32>());
     let gradients = GradientsParams::from_grads(l.total.backward(), &state.net);
+    let gradients = optim::complete(&state.net, gradients);
     let norm = optim::gradient_norm(&state.net, &gradients);
     let grad_norm = finite("gradient norm", norm)?;
     let gradients = optim::clip(&state.net, gradients, norm, experiment.optim.clip_norm);

@@ -74,6 +74,28 @@ impl ModuleVisitor for SquaredNorm<'_> {
     }
 }
 
+/// See [`complete`].
+struct Complete<'a> {
+    gradients: &'a mut GradientsParams,
+}
+
+impl ModuleVisitor for Complete<'_> {
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let value = param.val();
+        if value.is_require_grad() && self.gradients.get::<D>(param.id).is_none() {
+            self.gradients.register(param.id, value.inner().zeros_like());
+        }
+    }
+}
+
+/// Zero gradients for parameters that train but have none, as the value weights of the decoder's
+/// first layer: the optimiser passes over parameters without a gradient, and weight decay is for
+/// all of them (spec 2.6, 2.7).
+pub(super) fn complete<M: Module>(module: &M, mut gradients: GradientsParams) -> GradientsParams {
+    module.visit(&mut Complete { gradients: &mut gradients });
+    gradients
+}
+
 struct Scale<'a> {
     gradients: &'a mut GradientsParams,
     factor: f32,

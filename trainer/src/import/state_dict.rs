@@ -1,8 +1,9 @@
 //! Named tensors as plain values, and safetensors files of them.
 
-use super::WeightsError;
+use super::{Metadata, WeightsError, WeightsFile};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::BTreeMap;
+use std::io::{BufWriter, Write};
 use std::path::Path;
 
 /// One tensor of a file.
@@ -52,12 +53,16 @@ impl StateDict {
             std::mem::take(&mut self.tensors).into_iter().map(|(k, v)| (name(&k), v)).collect();
     }
 
-    /// Reads a safetensors file. Floating-point tensors become f32; integer tensors (counters of
-    /// batch norms, masks) are read as numbers too.
+    /// Reads the tensors of a weights file, safetensors or PyTorch. Floating-point tensors become
+    /// f32; integer tensors (counters of batch norms, masks) are read as numbers too.
     ///
     /// # Errors
     /// When the file cannot be read, is damaged or holds a number type not read here.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
+        Ok(WeightsFile::read(path)?.dict)
+    }
+
+    pub(super) fn read_safetensors(path: &Path) -> Result<Self, WeightsError> {
         let bytes = std::fs::read(path).map_err(|source| WeightsError::Io {
             action: "read",
             source,
@@ -77,19 +82,26 @@ impl StateDict {
         Ok(dict)
     }
 
-    /// Writes a safetensors file of f32 tensors: temporary name beside it, then rename.
+    /// Writes a safetensors file of f32 tensors: temporary name beside it, then rename. The same
+    /// tensors and metadata give the same bytes.
     ///
     /// # Errors
     /// When the file cannot be written; an older file of this name is then still there.
-    pub fn write(&self, path: &Path) -> Result<(), WeightsError> {
-        let bytes = self.to_bytes(path)?;
+    pub fn write(&self, path: &Path, metadata: &Metadata) -> Result<(), WeightsError> {
+        let table = self
+            .table(metadata)
+            .map_err(|e| WeightsError::Format { detail: e.to_string(), path: path.into() })?;
         let mut temporary = path.as_os_str().to_owned();
         temporary.push(format!(".{}.tmp", std::process::id()));
         let write = || {
-            let mut file = std::fs::File::create(&temporary)?;
-            std::io::Write::write_all(&mut file, &bytes)?;
+            let mut file = BufWriter::new(std::fs::File::create(&temporary)?);
+            file.write_all(&(table.len() as u64).to_le_bytes())?;
+            file.write_all(&table)?;
+            for value in self.tensors.values().flat_map(|t| &t.values) {
+                file.write_all(&value.to_le_bytes())?;
+            }
             // On disk before the old file is given up.
-            file.sync_all()?;
+            file.into_inner().map_err(|e| e.into_error())?.sync_all()?;
             std::fs::rename(&temporary, path)
         };
         write().map_err(|source| {
@@ -99,25 +111,31 @@ impl StateDict {
         })
     }
 
-    fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, WeightsError> {
-        let format = |e: safetensors::SafeTensorError| WeightsError::Format {
-            detail: e.to_string(),
-            path: path.into(),
-        };
-        let raw: Vec<(&str, &[usize], Vec<u8>)> = self
-            .iter()
-            .map(|(name, t)| {
-                let bytes = t.values.iter().flat_map(|v| v.to_le_bytes()).collect();
-                (name, t.shape.as_slice(), bytes)
-            })
-            .collect();
-        let views = raw
-            .iter()
-            .map(|(name, shape, bytes)| {
-                Ok((*name, TensorView::new(Dtype::F32, shape.to_vec(), bytes).map_err(format)?))
-            })
-            .collect::<Result<Vec<_>, WeightsError>>()?;
-        safetensors::serialize(views, None).map_err(format)
+    /// The table at the start of a safetensors file, padded so that the numbers are aligned. Written
+    /// here because the crate's writer wants a second copy of all tensors, and orders metadata at
+    /// random.
+    fn table(&self, metadata: &Metadata) -> Result<Vec<u8>, serde_json::Error> {
+        #[derive(serde::Serialize)]
+        #[serde(untagged)]
+        enum Entry<'a> {
+            Metadata(BTreeMap<String, String>),
+            Tensor { dtype: &'static str, shape: &'a [usize], data_offsets: [usize; 2] },
+        }
+        let mut entries = BTreeMap::new();
+        let metadata = metadata.to_map()?;
+        if !metadata.is_empty() {
+            entries.insert("__metadata__", Entry::Metadata(metadata));
+        }
+        let mut at = 0;
+        for (name, tensor) in self.iter() {
+            let end = at + 4 * tensor.values.len();
+            let (shape, data_offsets) = (tensor.shape.as_slice(), [at, end]);
+            entries.insert(name, Entry::Tensor { dtype: "F32", shape, data_offsets });
+            at = end;
+        }
+        let mut table = serde_json::to_vec(&entries)?;
+        table.resize(table.len().next_multiple_of(8), b' ');
+        Ok(table)
     }
 }
 

@@ -40,7 +40,7 @@ mod layers;
 mod names;
 mod resnet;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod transformer;
 
 pub use backbone::FreezePolicy;

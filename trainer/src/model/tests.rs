@@ -5,18 +5,17 @@ mod rearrangements;
 
 use super::*;
 use crate::import::{self, StateDict, StateTensor};
-use crate::losses::{LossWeights, losses};
 use burn::module::{ModuleVisitor, Param};
 use burn::tensor::Gradients;
 use std::path::Path;
 use tsda_runtime::Backbone;
 
 /// The small configuration of the golden vectors.
-fn small(test_embedding: bool) -> ModelSpec {
+pub(crate) fn small(test_embedding: bool) -> ModelSpec {
     ModelSpec { test_embedding, ..ModelSpec::SMALL }
 }
 
-const NO_DROPOUT: NetOptions =
+pub(crate) const NO_DROPOUT: NetOptions =
     NetOptions { dropout: 0.0, attention_dropout: 0.0, freeze: FreezePolicy::BeforeStride16 };
 
 /// Numbers in `[-1, 1)` from a name: FNV-1a seeds a splitmix64 stream (golden README).
@@ -33,7 +32,7 @@ pub(crate) fn stream(name: &str) -> impl Iterator<Item = u64> + use<> {
 }
 
 /// The recipe's value of a tensor with this state-dict name.
-fn recipe(name: &str, shape: &[usize]) -> Vec<f32> {
+pub(crate) fn recipe(name: &str, shape: &[usize]) -> Vec<f32> {
     let numel: usize = shape.iter().product();
     let (a, b) = if name.ends_with("running_mean") {
         (0.0, 0.2)
@@ -66,7 +65,7 @@ fn recipe(name: &str, shape: &[usize]) -> Vec<f32> {
 }
 
 /// A net with the recipe's weights.
-fn recipe_net(spec: &ModelSpec, options: &NetOptions, device: &Device) -> TrackerNet {
+pub(crate) fn recipe_net(spec: &ModelSpec, options: &NetOptions, device: &Device) -> TrackerNet {
     let net = TrackerNet::new(spec, options, device).unwrap();
     let mut dict = StateDict::default();
     for (name, tensor) in import::state_dict(&net).iter() {
@@ -77,7 +76,7 @@ fn recipe_net(spec: &ModelSpec, options: &NetOptions, device: &Device) -> Tracke
 }
 
 /// Normalised recipe image `(3, side, side)` of a frame.
-fn recipe_image(frame: usize, side: usize) -> Vec<f32> {
+pub(crate) fn recipe_image(frame: usize, side: usize) -> Vec<f32> {
     let tri = |t: usize, p: usize| (t % (2 * p)).abs_diff(p);
     let mut noise = stream(&format!("image.{frame}"));
     let mut image = Vec::with_capacity(3 * side * side);
@@ -97,7 +96,7 @@ fn recipe_image(frame: usize, side: usize) -> Vec<f32> {
     image
 }
 
-fn shared(name: &str) -> Option<StateDict> {
+pub(crate) fn shared(name: &str) -> Option<StateDict> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/golden/small").join(name);
     if !path.exists() {
         println!("skipped: {} is not there", path.display());
@@ -107,13 +106,13 @@ fn shared(name: &str) -> Option<StateDict> {
 }
 
 /// A file of reference figures that lives in the repository.
-fn committed(name: &str) -> StateDict {
+pub(crate) fn committed(name: &str) -> StateDict {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden/model");
     StateDict::read(&folder.join(name)).unwrap()
 }
 
 /// Compact copies of the small network's inputs and expected results.
-fn compact() -> StateDict {
+pub(crate) fn compact() -> StateDict {
     committed("small.safetensors")
 }
 
@@ -127,21 +126,30 @@ fn tensor<const D: usize>(
     Tensor::from_data(TensorData::new(found.values.clone(), shape), d)
 }
 
-fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
+pub(crate) fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
     t.into_data().iter::<f32>().collect()
 }
 
 /// Largest absolute difference; lengths must agree.
-fn difference(got: &[f32], want: &[f32]) -> f32 {
+pub(crate) fn difference(got: &[f32], want: &[f32]) -> f32 {
     assert_eq!(got.len(), want.len());
     got.iter().zip(want).fold(0.0f32, |m, (g, w)| m.max((g - w).abs()))
 }
 
-/// Tracking mode on sequence `seq` with `count` templates; score map and ltrb.
+/// Tracking mode of the recipe's net on sequence `seq` with `count` templates; score map and ltrb.
 fn track(spec: &ModelSpec, seq: usize, count: usize, dict: &StateDict) -> (Vec<f32>, Vec<f32>) {
+    track_with(&recipe_net(spec, &NO_DROPOUT, &Device::flex()), seq, count, dict)
+}
+
+/// [`track`] with any net of the small configuration.
+pub(crate) fn track_with(
+    net: &TrackerNet,
+    seq: usize,
+    count: usize,
+    dict: &StateDict,
+) -> (Vec<f32>, Vec<f32>) {
     let device = Device::flex();
-    let net = recipe_net(spec, &NO_DROPOUT, &device);
-    let (s, f) = (spec.crop_side(), spec.map_side());
+    let (s, f) = (net.spec().crop_side(), net.spec().map_side());
     let image = |frame| {
         let data = TensorData::new(recipe_image(frame, s), [1, 3, s, s]);
         Tensor::<4>::from_data(data, &device)
@@ -192,14 +200,14 @@ fn efficientnet_equals_a_numpy_reference() {
 }
 
 /// Inputs of the three golden sequences as one batch.
-struct Batch {
-    templates: Tensor<4>,
-    search: Tensor<4>,
-    labels: Tensor<3>,
-    ltrb: Tensor<4>,
+pub(crate) struct Batch {
+    pub(crate) templates: Tensor<4>,
+    pub(crate) search: Tensor<4>,
+    pub(crate) labels: Tensor<3>,
+    pub(crate) ltrb: Tensor<4>,
 }
 
-fn batch(dict: &StateDict, spec: &ModelSpec, device: &Device) -> Batch {
+pub(crate) fn batch(dict: &StateDict, spec: &ModelSpec, device: &Device) -> Batch {
     let (s, f) = (spec.crop_side(), spec.map_side());
     let image = |frame| {
         let data = TensorData::new(recipe_image(frame, s), [1, 3, s, s]);
@@ -337,70 +345,10 @@ impl ModuleVisitor for GradientDict<'_> {
     }
 }
 
-fn gradients(net: &TrackerNet, gradients: &Gradients) -> StateDict {
+pub(crate) fn gradients(net: &TrackerNet, gradients: &Gradients) -> StateDict {
     let mut visitor = GradientDict { path: Vec::new(), gradients, dict: StateDict::default() };
     net.visit(&mut visitor);
     visitor.dict
-}
-
-#[test]
-fn training_step_equals_the_reference() {
-    let Some(case) = shared("case_t_train_step_dropout0.safetensors") else { return };
-    let Some(inputs) = shared("inputs.safetensors") else { return };
-    let spec = small(true);
-    let f = spec.map_side();
-    let device = Device::flex().autodiff();
-    let net = recipe_net(&spec, &NO_DROPOUT, &device);
-    let b = batch(&inputs, &spec, &Device::flex());
-    let out = net.forward_train(b.templates, b.search, b.labels, b.ltrb);
-    for (what, got) in [("scores", values(out.scores.clone())), ("ltrb", values(out.ltrb.clone()))]
-    {
-        let off = difference(&got, &case.get(what).unwrap().values);
-        assert!(off <= 5e-5, "{what}: {off}");
-    }
-    let each = |name: &str| -> Vec<f32> {
-        (0..3).flat_map(|q| inputs.get(&format!("seq{q}.{name}")).unwrap().values.clone()).collect()
-    };
-    let label = Tensor::<3>::from_data(TensorData::new(each("test_label"), [3, f, f]), &device);
-    let target = TensorData::new(each("test_ltrb"), [3, 4, f, f]);
-    let target = Tensor::<4>::from_data(target, &device);
-    let region: Vec<bool> = each("test_region").iter().map(|v| *v != 0.0).collect();
-    let l = losses(LossWeights::default(), out.scores, label, out.ltrb, target, &region);
-    for (what, got) in [("loss_clf", &l.classification), ("loss_giou", &l.giou)] {
-        let want = case.get(what).unwrap().values[0];
-        let got = got.clone().into_scalar::<f32>();
-        // The reference reports the weighted loss.
-        let near = |w: f32| (got - w).abs() <= 1e-4 * w.abs();
-        assert!(near(want) || near(want / 100.0), "{what}: {got}, not {want}");
-    }
-    let total = l.total.clone().into_scalar::<f32>();
-    assert!((total - case.get("loss").unwrap().values[0]).abs() <= 1e-4 * total.abs());
-    let got = gradients(&net, &l.total.backward());
-    let mut compared = 0;
-    for (name, want) in case.iter().filter_map(|(n, t)| Some((n.strip_prefix("grad.")?, t))) {
-        let scale = want.values.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-        let Some(got) = got.get(name) else {
-            // Dead weights (spec 2.6): the value projection of a zero token is its bias.
-            assert!(scale == 0.0, "no gradient for {name}");
-            continue;
-        };
-        let off = difference(&got.values, &want.values);
-        // Biases before a batch norm and of attention keys have no gradient but rounding noise;
-        // the others reach hundreds.
-        assert!(off <= 1e-4 * scale.max(1.0), "{name}: off by {off} of {scale}");
-        compared += 1;
-    }
-    assert!(compared > 100, "{compared} gradients");
-    // Frozen layers have none.
-    assert!(got.get("feature_extractor.layer2.0.conv1.weight").is_none());
-    assert!(got.get("feature_extractor.layer3.0.bn1.running_mean").is_none());
-
-    // Statistics of the box MLP's batch norms.
-    let after = import::state_dict(&net.valid());
-    for (name, want) in case.iter().filter_map(|(n, t)| Some((n.strip_prefix("after.")?, t))) {
-        let off = difference(&after.get(name).unwrap().values, &want.values);
-        assert!(off <= 1e-5, "{name}: {off}");
-    }
 }
 
 /// A nano-like network small enough for a test.

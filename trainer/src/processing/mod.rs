@@ -58,10 +58,17 @@ pub fn sample_rng(seed: u64, index: u64) -> ChaCha8Rng {
 /// Cells whose centre lies strictly inside the box and less than one stride from the box's centre
 /// along both axes (spec 2.4, radius 1): where the box loss is taken. `bbox` in crop pixels.
 pub fn sample_region(spec: &ModelSpec, bbox: &BBox) -> Vec<bool> {
-    let (side, stride) = (spec.map_side(), ModelSpec::STRIDE as f32);
+    region_of_radius(spec, bbox, 1.0)
+}
+
+/// [`sample_region`] within another distance of the box's centre, in strides; 0 is no limit: all
+/// cells inside the box (spec 2.4).
+pub fn region_of_radius(spec: &ModelSpec, bbox: &BBox, radius: f32) -> Vec<bool> {
+    let side = spec.map_side();
+    let reach = if radius > 0.0 { radius * ModelSpec::STRIDE as f32 } else { f32::INFINITY };
     let (cx, cy) = bbox.centre();
     let inside = |at: f32, low: f32, high: f32, centre: f32| {
-        at > low.max(centre - stride) && at < high.min(centre + stride)
+        at > low.max(centre - reach) && at < high.min(centre + reach)
     };
     (0..side * side)
         .map(|i| {

@@ -2,7 +2,6 @@ use super::*;
 use crate::config::SamplerConfig;
 use crate::sampler::{PictureCache, Sampler};
 use crate::testing::StillPair;
-use safetensors::SafeTensors;
 use std::sync::Arc;
 
 fn spec() -> ModelSpec {
@@ -21,22 +20,77 @@ fn maker(config: &ProcessingConfig, seed: u64, augment: bool) -> BatchMaker {
 }
 
 #[test]
-fn regions_equal_the_reference() {
+fn targets_and_regions_equal_the_reference() {
+    use tsda_runtime::labels::{box_centre, gaussian, ltrb};
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/runtime/labels.safetensors");
-    let bytes = std::fs::read(path).unwrap();
-    let golden = SafeTensors::deserialize(&bytes).unwrap();
-    let boxes: Vec<f32> = golden
-        .tensor("boxes")
-        .unwrap()
-        .data()
-        .chunks_exact(4)
-        .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
-        .collect();
-    let regions = golden.tensor("sample_region").unwrap().data().to_vec();
-    for (n, b) in boxes.chunks_exact(4).enumerate() {
-        let got = sample_region(&ModelSpec::TOMP101, &BBox::new(b[0], b[1], b[2], b[3]));
-        let want: Vec<bool> = regions[n * 324..][..324].iter().map(|v| *v != 0).collect();
-        assert!(got == want, "box {n}: {b:?}");
+    let golden = crate::import::StateDict::read(path.as_ref()).unwrap();
+    let values = |name: &str| &golden.get(name).unwrap().values;
+    let spec = ModelSpec::TOMP101;
+    let (cells, sigma) = (spec.cells(), spec.label_sigma_cells());
+    // Kernels of even size have maps of one row and column more, centred half a cell further.
+    let labels = [
+        ("kernel 1", "train_label.sigma0.9.f18", 18),
+        ("kernel 3", "train_label.kernel3", 18),
+        ("kernel 4", "train_label.kernel4_evenpad", 19),
+    ];
+    let regions = [("radius 1", "sample_region", 1.0), ("radius 0", "sample_region_radius0", 0.0)];
+    let mut worst = [0.0f32; 4];
+    let mut inside = [0; 2];
+    for (n, b) in values("boxes").chunks_exact(4).enumerate() {
+        let bbox = BBox::new(b[0], b[1], b[2], b[3]);
+        let off = |got: &[f32], name: &str| {
+            let want = &values(name)[n * got.len()..][..got.len()];
+            got.iter().zip(want).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()))
+        };
+        for (i, (_, name, side)) in labels.into_iter().enumerate() {
+            let mut label = vec![0.0; side * side];
+            gaussian(box_centre(&spec, &bbox), sigma, side, &mut label);
+            worst[i] = worst[i].max(off(&label, name));
+        }
+        let mut edges = vec![0.0; 4 * cells];
+        ltrb(&spec, &bbox, &mut edges);
+        worst[3] = worst[3].max(off(&edges, "ltrb_target"));
+        for (i, (what, name, radius)) in regions.into_iter().enumerate() {
+            let got = region_of_radius(&spec, &bbox, radius);
+            let want: Vec<bool> =
+                values(name)[n * cells..][..cells].iter().map(|v| *v != 0.0).collect();
+            assert!(got == want, "{what}, box {n}: {b:?}");
+            inside[i] += got.iter().filter(|r| **r).count();
+        }
+        assert!(sample_region(&spec, &bbox) == region_of_radius(&spec, &bbox, 1.0));
+    }
+    for ((what, ..), off) in labels.iter().zip(worst) {
+        println!("label of {what}: within {off:.1e}");
+    }
+    println!("ltrb: within {:.1e}; cells in regions of radius 1 and 0: {inside:?}", worst[3]);
+    assert!(worst.iter().all(|off| *off <= 1e-6), "{worst:?}");
+    assert_eq!(inside, [12, 20]);
+}
+
+#[test]
+fn a_mirrored_crop_is_the_mirror_image_but_its_box_is_one_pixel_off() {
+    let still = JitterConfig { scale: 0.0, centre: 0.0, aspect: 0.0 };
+    let config = |crop_flip_p| ProcessingConfig {
+        template: still,
+        search: still,
+        brightness: 0.0,
+        grayscale_p: 0.0,
+        joint_flip_p: 0.0,
+        crop_flip_p,
+        ..Default::default()
+    };
+    let (plain, turned) = (maker(&config(0.0), 3, true), maker(&config(1.0), 3, true));
+    for i in 0..6 {
+        let (a, b) = (plain.sample(i).unwrap(), turned.sample(i).unwrap());
+        for (a, b) in
+            a.templates.iter().chain([&a.search]).zip(b.templates.iter().chain([&b.search]))
+        {
+            let rows = a.pixels.chunks_exact(64).zip(b.pixels.chunks_exact(64));
+            assert!(rows.into_iter().all(|(a, b)| a.iter().rev().eq(b)));
+            // Mirrored about the edges it would be 64 - (x + w).
+            assert!((b.bbox.x - (63.0 - a.bbox.right())).abs() < 1e-4, "{:?} {:?}", a.bbox, b.bbox);
+            assert_eq!((a.bbox.y, a.bbox.w, a.bbox.h), (b.bbox.y, b.bbox.w, b.bbox.h));
+        }
     }
 }
 
