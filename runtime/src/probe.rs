@@ -17,9 +17,14 @@
 //!             4 * F * F f32 ltrb, edge by edge, row-major
 //! ```
 
+#[cfg(feature = "std")]
+mod timing;
+
 use crate::engine::{Engine, EngineError};
 use crate::geometry::BBox;
 pub use crate::labels::template_maps;
+#[cfg(feature = "std")]
+pub use timing::{StageTime, stage_times};
 use crate::spec::{MAX_TEMPLATES, ModelSpec};
 
 /// First bytes of the section.

@@ -9,11 +9,15 @@
 //!    [`Engine::write_template`]: the head feature of the last `features` call becomes the tokens of
 //!    that slot.
 
+#[cfg(any(feature = "tract", feature = "ort"))]
+pub mod any;
 #[cfg(feature = "ort")]
 pub mod ort;
 #[cfg(feature = "tract")]
 pub mod tract;
 
+#[cfg(any(feature = "tract", feature = "ort"))]
+pub use any::{AnyEngine, EngineChoice};
 #[cfg(feature = "tract")]
 pub use tract::TractEngine;
 
@@ -24,7 +28,7 @@ pub trait Engine {
     /// The network's shape.
     fn spec(&self) -> &ModelSpec;
 
-    /// Short name for logs and reports: `tract`, `ort`, `native`, `burn`.
+    /// Short name for logs and reports: `tract`, `ort`, `ort:cuda`, `native`, `burn`.
     fn name(&self) -> &'static str;
 
     /// Input of the `features` graph: `(3, S, S)`, channels R, G, B, normalised

@@ -1,31 +1,45 @@
 //! ONNX Runtime, loaded from a shared library at run time.
 //!
 //! The library is the one named by the environment variable `TSDA_ORT_LIB`, else by
-//! `ORT_DYLIB_PATH`, else the system's `libonnxruntime.so`; 1.17 or newer. The PyPI wheel holds one
-//! (`onnxruntime/capi/libonnxruntime.so.*`).
+//! `ORT_DYLIB_PATH`, else the system's `libonnxruntime.so`; 1.17 or newer. The PyPI wheel holds one;
+//! `scripts/fetch_onnxruntime.sh` unpacks it.
+//!
+//! All inputs and outputs are bound to buffers made once. On the processor the graphs read and write
+//! these buffers in place. On a GPU the head feature and the template tokens stay in its memory;
+//! what the tracker writes (crop, label, box map) goes up before the run that reads it, because
+//! ONNX Runtime copies a bound input when it is bound and not when it runs, and the two maps come
+//! down with the run that makes them.
 
 pub mod graph;
 mod inline;
+mod library;
+mod options;
+#[cfg(all(test, feature = "tract"))]
+mod tests;
+
+pub use library::{LIBRARY_VARIABLES, OrtError, OrtLibrary};
+pub use options::{Optimisation, OrtOptions, Provider};
 
 use super::{Engine, EngineError, Maps, Stage, TemplateInput, slot_shape};
 use crate::bundle::{Bundle, SectionKind, WEIGHTS_FILE};
 use crate::spec::ModelSpec;
-use ::ort::environment::Environment;
-
-use ::ort::memory::Allocator;
+use ::ort::memory::{AllocatorType, Allocator, MemoryInfo, MemoryType};
 use ::ort::session::{IoBinding, Session};
 use ::ort::value::{Outlet, Tensor, ValueType};
-use std::sync::OnceLock;
+use std::path::PathBuf;
 
 const NAME: &str = "ort";
 
 /// A bundle's network on ONNX Runtime.
 ///
-/// Inputs and outputs are bound once and shared between the graphs: nothing is copied, and the Rust
-/// side allocates a few hundred bytes per call inside the `ort` crate.
+/// Inputs and outputs are bound once and shared between the graphs; the Rust side allocates a few
+/// hundred bytes per call inside the `ort` crate.
 #[derive(Debug)]
 pub struct OrtEngine {
     spec: ModelSpec,
+    name: &'static str,
+    /// Inputs that the tracker writes must be sent to the device before each run.
+    upload: bool,
     features: Graph,
     /// Index: the slot the tokens are written to.
     template: Session,
@@ -51,29 +65,46 @@ struct Graph {
 type Port<'a> = (&'a str, &'a mut Tensor<f32>);
 
 impl OrtEngine {
-    /// Loads the library and the graphs of a bundle; one thread.
+    /// Loads the library and the graphs of a bundle; on the processor, one thread.
     ///
     /// # Errors
     /// When the library cannot be loaded or is too old, a graph is missing or does not fit the
-    /// specification, or ONNX Runtime refuses it.
+    /// specification, or ONNX Runtime refuses it. [`Self::with_options`] has the longer messages.
     pub fn from_bundle(bundle: &Bundle<'_>) -> Result<Self, EngineError> {
         Self::with_threads(bundle, 1)
     }
 
-    /// As [`Self::from_bundle`], with this many threads per operation; 0 for one per core. Waiting
-    /// threads sleep: spinning costs more than it gains on a busy board.
+    /// As [`Self::from_bundle`], with this many threads per operation; 0 for one per core.
     ///
     /// # Errors
     /// As [`Self::from_bundle`].
     pub fn with_threads(bundle: &Bundle<'_>, threads: usize) -> Result<Self, EngineError> {
-        let spec = bundle.manifest().spec;
-        let (side, map, width) = (spec.crop_side(), spec.map_side(), usize::from(spec.width));
-        let environment = environment()?;
-        let open = |kind| open(environment, bundle, kind, threads);
+        let options = OrtOptions { threads, ..OrtOptions::default() };
+        Self::with_options(bundle, &options).map_err(EngineError::from)
+    }
 
-        let features = open(SectionKind::FeaturesOnnx)?;
+    /// Loads the library and the graphs of a bundle. An execution provider that is not there is an
+    /// error: nothing falls back to the processor in silence.
+    ///
+    /// # Errors
+    /// When the options do not go together, the library or the provider is missing or cannot start,
+    /// a graph is missing or does not fit the specification, or ONNX Runtime refuses it.
+    pub fn with_options(bundle: &Bundle<'_>, options: &OrtOptions) -> Result<Self, OrtError> {
+        options.check().map_err(OrtError::Options)?;
+        let library = OrtLibrary::get()?;
+        library.require(options.provider)?;
+        let loader = Loader { library, bundle, options, cache: cache_folder(bundle, options)? };
+        Self::assemble(&loader, options.provider.memory().is_some())
+    }
+
+    fn assemble(loader: &Loader<'_>, upload: bool) -> Result<Self, OrtError> {
+        let spec = loader.bundle.manifest().spec;
+        let (side, map, width) = (spec.crop_side(), spec.map_side(), usize::from(spec.width));
+
+        let features = loader.open(SectionKind::FeaturesOnnx)?;
+        let shared = loader.shared_memory(&features)?;
         let mut crop = zeros(&[1, 3, side, side])?;
-        let mut feature = zeros(&[1, width, map, map])?;
+        let mut feature = empty(&shared, &[1, width, map, map])?;
         let binding = bind(
             SectionKind::FeaturesOnnx,
             &features,
@@ -82,7 +113,7 @@ impl OrtEngine {
         )?;
         let features = Graph { session: features, binding };
 
-        let template = open(SectionKind::TemplateOnnx)?;
+        let template = loader.open(SectionKind::TemplateOnnx)?;
         let declared = template.outputs().iter().find(|o| o.name() == "tokens").map(Outlet::dtype);
         let declared = match declared {
             Some(ValueType::Tensor { shape, .. }) => Some(&shape[..]),
@@ -94,7 +125,7 @@ impl OrtEngine {
         let mut tokens = Vec::new();
         let mut template_bindings = Vec::new();
         for _ in 0..spec.templates {
-            let mut slot = zeros(&slot_shape)?;
+            let mut slot = empty(&shared, &slot_shape)?;
             template_bindings.push(bind(
                 SectionKind::TemplateOnnx,
                 &template,
@@ -110,7 +141,7 @@ impl OrtEngine {
         let mut predict = Vec::new();
         for k in 1..=spec.templates {
             let kind = SectionKind::PredictOnnx(k);
-            let session = open(kind)?;
+            let session = loader.open(kind)?;
             let slots = names.iter().map(String::as_str).zip(&mut tokens).take(k.into());
             let mut inputs: Vec<Port<'_>> = slots.collect();
             inputs.push(("feature", &mut feature));
@@ -120,6 +151,8 @@ impl OrtEngine {
         }
         Ok(Self {
             spec,
+            name: loader.options.provider.engine_name(),
+            upload,
             features,
             template,
             template_bindings,
@@ -148,7 +181,7 @@ impl Engine for OrtEngine {
     }
 
     fn name(&self) -> &'static str {
-        NAME
+        self.name
     }
 
     fn crop_mut(&mut self) -> &mut [f32] {
@@ -158,7 +191,11 @@ impl Engine for OrtEngine {
     fn features(&mut self) -> Result<(), EngineError> {
         // Whatever was there belongs to an older crop.
         self.has_feature = false;
-        self.features.run(Stage::Features)?;
+        let stage = Stage::Features;
+        if self.upload {
+            send(&mut self.features.binding, &[("crop", &self.crop)], stage)?;
+        }
+        self.features.run(stage)?;
         self.has_feature = true;
         Ok(())
     }
@@ -171,9 +208,14 @@ impl Engine for OrtEngine {
         let stage = Stage::Template;
         self.need_feature(stage)?;
         let slots = self.template_bindings.len();
-        let Some(binding) = self.template_bindings.get(slot) else {
+        let Some(binding) = self.template_bindings.get_mut(slot) else {
             return Err(error(stage, format_args!("slot {slot} of a network with {slots} slots")));
         };
+        // A failed run leaves anything in the slot.
+        self.written[slot] = false;
+        if self.upload {
+            send(binding, &[("label", &self.label), ("ltrb", &self.ltrb)], stage)?;
+        }
         run(&mut self.template, binding, stage)?;
         self.written[slot] = true;
         Ok(())
@@ -208,44 +250,76 @@ fn run(session: &mut Session, binding: &IoBinding, stage: Stage) -> Result<(), E
     }
 }
 
-/// The process's one ONNX Runtime environment; a failed attempt is remembered.
-fn environment() -> Result<&'static Environment, EngineError> {
-    static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
-    let made = ENVIRONMENT.get_or_init(|| {
-        let named = |variable| std::env::var_os(variable).filter(|v| !v.is_empty());
-        let system = || {
-            let (prefix, suffix) = (std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
-            format!("{prefix}onnxruntime{suffix}").into()
-        };
-        let library =
-            named("TSDA_ORT_LIB").or_else(|| named("ORT_DYLIB_PATH")).unwrap_or_else(system);
-        let builder = ::ort::init_from(&library)
-            .map_err(|e| format!("{e}; set TSDA_ORT_LIB to an ONNX Runtime library"))?;
-        builder.with_name("tsda").build().map_err(|e| e.to_string())
-    });
-    made.as_ref().map_err(|e| error(Stage::Load, format_args!("{e}")))
+/// Sends what the tracker wrote to the device: binding is what copies.
+fn send(
+    binding: &mut IoBinding,
+    inputs: &[(&str, &Tensor<f32>)],
+    stage: Stage,
+) -> Result<(), EngineError> {
+    let failed = |e: ::ort::Error| error(stage, format_args!("sending inputs: {e}"));
+    for (name, tensor) in inputs {
+        binding.bind_input(*name, tensor).map_err(failed)?;
+    }
+    binding.synchronize_inputs().map_err(failed)
 }
 
-fn open(
-    environment: &Environment,
-    bundle: &Bundle<'_>,
-    kind: SectionKind,
-    threads: usize,
-) -> Result<Session, EngineError> {
-    let load = |detail: core::fmt::Arguments<'_>| error(Stage::Load, detail);
-    let onnx = bundle.require(kind).map_err(|e| load(format_args!("{e}")))?;
+/// What it takes to open the graphs of one bundle.
+struct Loader<'a> {
+    library: &'static OrtLibrary,
+    bundle: &'a Bundle<'a>,
+    options: &'a OrtOptions,
+    cache: Option<PathBuf>,
+}
+
+impl Loader<'_> {
+    fn open(&self, kind: SectionKind) -> Result<Session, OrtError> {
+        let load = |detail: core::fmt::Arguments<'_>| error(Stage::Load, detail);
+        let onnx = self.bundle.require(kind).map_err(|e| load(format_args!("{e}")))?;
+        let weights = self.bundle.section(SectionKind::Weights).unwrap_or_default();
+        let model = inline::inline(onnx, WEIGHTS_FILE, weights)
+            .map_err(|reason| load(format_args!("{kind}: {reason}")))?;
+        let failed = |e: &dyn core::fmt::Display| load(format_args!("{kind}: {e}"));
+        let options = self.options;
+        let builder = Session::builder(&self.library.environment)
+            .map_err(|e| failed(&e))?
+            .with_intra_threads(options.threads)
+            .map_err(|e| failed(&e))?
+            .with_intra_op_spinning(false)
+            .map_err(|e| failed(&e))?
+            .with_optimization_level(options.optimisation.level())
+            .map_err(|e| failed(&e))?;
+        let providers = options.providers(self.cache.as_deref());
+        let mut builder =
+            builder.with_execution_providers(providers).map_err(|e| OrtError::Start {
+                provider: options.provider,
+                reason: e.to_string(),
+                version: self.library.version().to_owned(),
+                library: self.library.path().to_owned(),
+            })?;
+        builder.commit_from_memory(&model).map_err(|e| failed(&e).into())
+    }
+
+    /// Where tensors live that only graphs read and write.
+    fn shared_memory(&self, session: &Session) -> Result<Allocator, OrtError> {
+        let Some(device) = self.options.provider.memory() else { return Ok(Allocator::default()) };
+        let failed = |e: ::ort::Error| error(Stage::Load, format_args!("device memory: {e}"));
+        // `OrtOptions::check` has looked at the range.
+        let id = self.options.device as i32;
+        let info = MemoryInfo::new(device, id, AllocatorType::Device, MemoryType::Default);
+        Ok(Allocator::new(session, info.map_err(failed)?).map_err(failed)?)
+    }
+}
+
+/// The bundle's own folder for TensorRT's engines, made if needed. TensorRT recognises a graph by
+/// its structure and not by its weights, so two trainings of one network must not share a folder.
+fn cache_folder(bundle: &Bundle<'_>, options: &OrtOptions) -> Result<Option<PathBuf>, OrtError> {
+    let Some(root) = &options.cache else { return Ok(None) };
     let weights = bundle.section(SectionKind::Weights).unwrap_or_default();
-    let model = inline::inline(onnx, WEIGHTS_FILE, weights)
-        .map_err(|reason| load(format_args!("{kind}: {reason}")))?;
-    let failed = |e: &dyn core::fmt::Display| load(format_args!("{kind}: {e}"));
-    Session::builder(environment)
-        .map_err(|e| failed(&e))?
-        .with_intra_threads(threads)
-        .map_err(|e| failed(&e))?
-        .with_intra_op_spinning(false)
-        .map_err(|e| failed(&e))?
-        .commit_from_memory(&model)
-        .map_err(|e| failed(&e))
+    let precision = if options.fp16 { "fp16" } else { "fp32" };
+    let path = root.join(format!("{:08x}-{precision}", crate::bundle::crc32(weights)));
+    std::fs::create_dir_all(&path)
+        .map_err(|e| OrtError::Cache { path: path.clone(), reason: e.to_string() })?;
+    Ok(Some(path))
 }
 
 /// Binds all inputs and outputs of a session, after a look at what it declares.
@@ -296,12 +370,17 @@ fn check(
     Ok(())
 }
 
+/// A tensor in the processor's memory.
 fn zeros(shape: &[usize]) -> Result<Tensor<f32>, EngineError> {
-    let shape: Vec<i64> = shape.iter().map(|&side| side as i64).collect();
-    let failed = |e: ::ort::Error| error(Stage::Load, format_args!("{e}"));
-    let mut tensor = Tensor::new(&Allocator::default(), shape).map_err(failed)?;
+    let mut tensor = empty(&Allocator::default(), shape)?;
     write(&mut tensor).fill(0.0);
     Ok(tensor)
+}
+
+/// A tensor with anything in it: no graph reads it before another has written it.
+fn empty(allocator: &Allocator, shape: &[usize]) -> Result<Tensor<f32>, EngineError> {
+    let shape: Vec<i64> = shape.iter().map(|&side| side as i64).collect();
+    Tensor::new(allocator, shape).map_err(|e| error(Stage::Load, format_args!("{e}")))
 }
 
 /// The numbers of a tensor of ours; empty only if it were not one of floats in CPU memory.

@@ -356,4 +356,4 @@ fn error(stage: Stage, detail: core::fmt::Arguments<'_>) -> EngineError {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -11,7 +11,7 @@ use crate::tracker::Tracker;
 use crate::{BBox, FrameView};
 use prost::Message as _;
 
-const SPEC: ModelSpec = ModelSpec { crop: 48, width: 4, heads: 1, ..ModelSpec::NANO };
+pub(in crate::engine) const SPEC: ModelSpec = ModelSpec { crop: 48, width: 4, heads: 1, ..ModelSpec::NANO };
 const SIDE: usize = 3;
 const CELLS: usize = SIDE * SIDE;
 
@@ -87,7 +87,7 @@ fn weights() -> Vec<f32> {
     (0..4 * 3 * 256).map(|i| ((i * 37 % 101) as f32 - 50.0) * 1e-3).collect()
 }
 
-fn external(offset: &str, length: &str) -> pb::TensorProto {
+pub(in crate::engine) fn external(offset: &str, length: &str) -> pb::TensorProto {
     let entry = |key: &str, value: &str| pb::StringStringEntryProto {
         key: key.into(),
         value: value.into(),
@@ -107,7 +107,7 @@ fn external(offset: &str, length: &str) -> pb::TensorProto {
 }
 
 /// One 16 x 16 convolution of stride 16.
-fn features_with(kernel: pb::TensorProto) -> pb::ModelProto {
+pub(in crate::engine) fn features_with(kernel: pb::TensorProto) -> pb::ModelProto {
     let attributes = vec![ints("kernel_shape", &[16, 16]), ints("strides", &[16, 16])];
     model(
         vec![node("Conv", &["crop", "kernel"], "feature", attributes)],
@@ -178,7 +178,7 @@ fn weights_section() -> Vec<u8> {
     [0; 64].into_iter().chain(weights().into_iter().flat_map(f32::to_le_bytes)).collect()
 }
 
-fn parts() -> Vec<(Kind, Vec<u8>)> {
+pub(in crate::engine) fn parts() -> Vec<(Kind, Vec<u8>)> {
     vec![
         (Kind::FeaturesOnnx, features().encode_to_vec()),
         (Kind::TemplateOnnx, template().encode_to_vec()),
@@ -188,7 +188,7 @@ fn parts() -> Vec<(Kind, Vec<u8>)> {
     ]
 }
 
-fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
+pub(in crate::engine) fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
     let mut manifest = Manifest {
         name: "tiny",
         spec: SPEC,
@@ -218,7 +218,7 @@ fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
     out
 }
 
-fn load(parts: &[(Kind, Vec<u8>)]) -> Result<TractEngine, EngineError> {
+pub(in crate::engine) fn load(parts: &[(Kind, Vec<u8>)]) -> Result<TractEngine, EngineError> {
     TractEngine::from_bundle(&Bundle::parse(&write(parts)).unwrap())
 }
 
