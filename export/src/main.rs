@@ -1,7 +1,8 @@
 //! `tsda-export`: build, check and unpack bundles, count what they compute, compare back ends with
 //! golden figures.
 //!
-//! Exit codes: 0 done; 1 an engine differs by more than the tolerance; 2 bad input.
+//! Exit codes: 0 done; 1 an engine differs by more than the tolerance; 2 bad input, or an engine
+//! that was asked for is not there or fails.
 
 #[path = "golden_cli.rs"]
 mod golden;
@@ -11,12 +12,13 @@ use clap::{Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use tsda_export::build::{BuildOptions, build};
-use tsda_export::check::check;
+use tsda_export::check::check_on;
 use tsda_export::macs::{self, MacsReport};
 use tsda_export::network;
 use tsda_export::unpack::unpack;
 use tsda_runtime::ModelSpec;
 use tsda_runtime::bundle::{BundleFile, TrainedOn};
+use tsda_runtime::engine::EngineChoice;
 
 /// Turns trained weights into bundles that run on a board, and checks them.
 #[derive(Parser)]
@@ -69,6 +71,10 @@ enum Command {
         /// Largest absolute difference allowed.
         #[arg(long, default_value_t = 1e-4, value_parser = tolerance)]
         tolerance: f32,
+        /// Only this engine: tract, ort, ort:cuda, ort:tensorrt (docs/engines.md) [default: every
+        /// one of this build that is on the machine].
+        #[arg(long)]
+        engine: Option<EngineChoice>,
     },
     /// Compares back ends with golden figures of the network, tensor by tensor.
     Golden(golden::GoldenArgs),
@@ -172,11 +178,14 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
             println!("{}: {} bytes", options.out.display(), report.bundle);
             Ok(ExitCode::SUCCESS)
         }
-        Command::Check { bundle, tolerance } => {
+        Command::Check { bundle, tolerance, engine } => {
             let file = BundleFile::open(&bundle)?;
             let named = || format!("{}", bundle.display());
-            let report = check(&file.bundle()?).with_context(named)?;
+            let report = check_on(&file.bundle()?, engine.as_ref()).with_context(named)?;
             print!("{report}");
+            if let Some(unchecked) = report.failure() {
+                anyhow::bail!("engine {}: {}", unchecked.engine, unchecked.error);
+            }
             let max = report.max();
             if max <= tolerance {
                 println!("\nlargest difference {max:.3e}, allowed {tolerance:.3e}: ok");

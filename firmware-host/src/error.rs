@@ -74,9 +74,17 @@ pub enum HostError {
         /// What the tracker said.
         source: Box<tsda_runtime::TrackError>,
     },
-    /// The engine could not be built from the bundle.
+    /// The engine is not there on this machine, or could not be built from the bundle.
     #[error("{}: {source}", bundle.display())]
     Engine {
+        /// The bundle.
+        bundle: PathBuf,
+        /// What the engine said.
+        source: Box<tsda_runtime::engine::any::OpenError>,
+    },
+    /// An engine failed while it was timed.
+    #[error("{}: {source}", bundle.display())]
+    Timing {
         /// The bundle.
         bundle: PathBuf,
         /// What the engine said.
@@ -121,10 +129,13 @@ impl HostError {
             | Self::Probe { .. }
             | Self::Replay(_)
             | Self::Create { .. } => EXIT_BAD_INPUT,
+            // The choice of engine is the user's.
+            Self::Engine { source, .. } if source.is_absent() => EXIT_BAD_INPUT,
             Self::Write { .. }
             | Self::Encode { .. }
             | Self::Tracker { .. }
             | Self::Engine { .. }
+            | Self::Timing { .. }
             | Self::ProbeRun { .. }
             | Self::Eval(_)
             | Self::Interrupted => EXIT_RUNTIME,

@@ -3,7 +3,8 @@
 //! The pieces of the program `tsda`, in the order a frame meets them:
 //! 1. [`frames`]: folders, lists that mix sensors, Y4M on a pipe; [`sequence`]: clips with known
 //!    boxes; [`render`]: the clip the project draws itself.
-//! 2. [`model`]: the embedded bundle or one from a file, and the tracker built from it.
+//! 2. [`model`]: the embedded bundle or one from a file, and the tracker built from it on the
+//!    engine of [`engine`]'s arguments.
 //! 3. [`track`]: drives a tracker on any engine through a source into outputs.
 //! 4. [`video`]: GIF, page, PNG files, strip; [`metrics`]: figures against known boxes.
 //! 5. [`replay`]: scripted runs, to check the tracker frame by frame.
@@ -11,6 +12,7 @@
 //!    appear whole or not at all.
 
 pub mod cli;
+pub mod engine;
 pub mod error;
 pub mod frames;
 pub mod metrics;

@@ -4,7 +4,7 @@ use crate::error::HostError;
 use std::path::Path;
 use tsda_runtime::Tracker;
 use tsda_runtime::bundle::{Bundle, BundleFile};
-use tsda_runtime::engine::tract::TractEngine;
+use tsda_runtime::engine::{AnyEngine, EngineChoice};
 
 /// `models/nano.tsda` of the repository at build time.
 static EMBEDDED: Option<&[u8]> = include!(concat!(env!("OUT_DIR"), "/embedded.rs"));
@@ -35,34 +35,34 @@ pub fn load(path: Option<&Path>) -> Result<BundleFile, HostError> {
 ///
 /// # Errors
 /// When the engine cannot be built from the bundle's graphs.
-pub fn tracker(file: &BundleFile) -> Result<Tracker<TractEngine>, HostError> {
+pub fn tracker(file: &BundleFile) -> Result<Tracker<AnyEngine>, HostError> {
+    tracker_on(file, &EngineChoice::default())
+}
+
+/// A tracker on an engine, with the thresholds the bundle was tuned with.
+///
+/// # Errors
+/// When the engine is not there on this machine or cannot be built from the bundle's graphs.
+pub fn tracker_on(
+    file: &BundleFile,
+    choice: &EngineChoice,
+) -> Result<Tracker<AnyEngine>, HostError> {
     let bundle = file.bundle()?;
     let params = bundle.manifest().tracker;
-    Tracker::new(engine(file, &bundle)?, params)
+    Tracker::new(engine(file, &bundle, choice)?, params)
         .map_err(|source| HostError::Tracker { frame: 0, source: Box::new(source) })
 }
 
-/// The default engine.
+/// An engine for a bundle.
 ///
 /// # Errors
-/// When it cannot be built from the bundle's graphs.
-pub fn engine(file: &BundleFile, bundle: &Bundle<'_>) -> Result<TractEngine, HostError> {
-    TractEngine::from_bundle(bundle).map_err(|source| HostError::Engine {
-        bundle: file.path().to_path_buf(),
-        source: Box::new(source),
-    })
-}
-
-/// ONNX Runtime, from the shared library found at run time.
-///
-/// # Errors
-/// When there is no library, or it refuses the bundle's graphs.
-#[cfg(feature = "ort")]
-pub fn ort_engine(
+/// When it is not there on this machine or cannot be built from the bundle's graphs.
+pub fn engine(
     file: &BundleFile,
     bundle: &Bundle<'_>,
-) -> Result<tsda_runtime::engine::ort::OrtEngine, HostError> {
-    tsda_runtime::engine::ort::OrtEngine::from_bundle(bundle).map_err(|source| HostError::Engine {
+    choice: &EngineChoice,
+) -> Result<AnyEngine, HostError> {
+    choice.open(bundle).map_err(|source| HostError::Engine {
         bundle: file.path().to_path_buf(),
         source: Box::new(source),
     })

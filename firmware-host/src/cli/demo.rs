@@ -21,7 +21,8 @@ const STRIP: &str = "strip.png";
 
 pub(super) fn run(args: &DemoArgs) -> Result<u8, HostError> {
     let bundle = model::load(args.bundle.as_deref())?;
-    let mut tracker = model::tracker(&bundle)?;
+    let choice = args.engine.choice()?;
+    let mut tracker = model::tracker_on(&bundle, &choice)?;
     let switching = args.switch_every.map_or(Switching::Middle, |n| Switching::Every(n as usize));
     let (mut source, truth, what) = open(args, switching)?;
     let first = truth.first().copied().flatten().ok_or_else(|| HostError::Init {
@@ -39,7 +40,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<u8, HostError> {
         Box::new(Strip::create(&args.out.join(STRIP))?),
     ];
     println!("clip:   {what}");
-    println!("model:  {}", bundle.path().display());
+    println!("model:  {} on {choice}", bundle.path().display());
     let bar = progress_bar(total, "tracking");
     let run = Run { init: first, init_from: &what, truth: &truth, stop: stop_flag() };
     let steps = run.drive(&mut tracker, source.as_mut(), sinks, |step| {

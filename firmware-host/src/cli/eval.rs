@@ -14,22 +14,22 @@ use tsda_eval::pseudo::{PseudoOptions, clips};
 use tsda_eval::summary::{Summary, markdown};
 use tsda_eval::{Evaluation, Options, evaluate, otb};
 use tsda_runtime::bundle::BundleFile;
-use tsda_runtime::engine::tract::TractEngine;
+use tsda_runtime::engine::{AnyEngine, EngineChoice};
 use tsda_runtime::{BBox, Modality, Tracker};
 
 /// A bundle's tracker as the evaluation drives it.
 struct BundleTracker {
     name: String,
-    tracker: Tracker<TractEngine>,
+    tracker: Tracker<AnyEngine>,
     /// Size of the frame before: sensors may differ in resolution.
     size: (usize, usize),
     last: BBox,
 }
 
 impl BundleTracker {
-    fn new(file: &BundleFile) -> Result<Self, HostError> {
+    fn new(file: &BundleFile, choice: &EngineChoice) -> Result<Self, HostError> {
         let name = file.bundle()?.manifest().name.to_owned();
-        let tracker = model::tracker(file)?;
+        let tracker = model::tracker_on(file, choice)?;
         Ok(Self { name, tracker, size: (0, 0), last: BBox::default() })
     }
 }
@@ -61,6 +61,8 @@ type Maker<'a> = Box<dyn Fn() -> Result<Box<dyn TrackerUnderTest>, TrackerError>
 
 pub(super) fn run(args: &EvalArgs) -> Result<u8, HostError> {
     let bundle = model::load(args.bundle.as_deref())?;
+    // An engine that cannot be had should be known before the data are looked at.
+    drop(model::engine(&bundle, &bundle.bundle()?, &args.engine)?);
     let data = open(args)?;
     let protocols = if args.protocol.is_empty() {
         Protocol::CROSS_MODAL.to_vec()
@@ -71,7 +73,7 @@ pub(super) fn run(args: &EvalArgs) -> Result<u8, HostError> {
         .map_err(|source| HostError::Create { path: args.out.clone(), source })?;
 
     let mut makers: Vec<Maker<'_>> = vec![Box::new(|| {
-        let tracker = BundleTracker::new(&bundle).map_err(TrackerError::new)?;
+        let tracker = BundleTracker::new(&bundle, &args.engine).map_err(TrackerError::new)?;
         Ok(Box::new(tracker) as Box<dyn TrackerUnderTest>)
     })];
     if args.baselines {

@@ -4,13 +4,53 @@ use super::{InfoArgs, grouped};
 use crate::error::{EXIT_OK, HostError};
 use crate::model;
 use std::fmt::Write as _;
+use std::path::Path;
+use std::time::Instant;
 use tsda_runtime::Backbone;
 use tsda_runtime::bundle::{Bundle, SectionKind};
+use tsda_runtime::engine::AnyEngine;
+use tsda_runtime::probe::{StageTime, stage_times};
+
+/// Calls of each graph that are timed.
+const REPETITIONS: usize = 15;
 
 pub(super) fn run(args: &InfoArgs) -> Result<u8, HostError> {
     let file = model::load(args.bundle.as_deref())?;
-    print!("{}", describe(&file.path().display().to_string(), &file.bundle()?));
+    let bundle = file.bundle()?;
+    print!("{}", describe(&file.path().display().to_string(), &bundle));
+    if let Some(choice) = &args.engine {
+        let start = Instant::now();
+        let mut engine = model::engine(&file, &bundle, choice)?;
+        let loading = start.elapsed().as_secs_f64() * 1e3;
+        let path = file.path();
+        let about = choice.describe().map_err(|source| HostError::Engine {
+            bundle: path.to_path_buf(),
+            source: Box::new(source),
+        })?;
+        println!("\nengine\n  {about}\n  {:<10} {loading:>9.1} ms", "loading");
+        print!("{}", stage_table(path, &mut engine, "  ")?);
+    }
     Ok(EXIT_OK)
+}
+
+/// One line per graph: its best and its median time on this machine.
+pub(super) fn stage_table(
+    path: &Path,
+    engine: &mut AnyEngine,
+    indent: &str,
+) -> Result<String, HostError> {
+    let times = stage_times(engine, REPETITIONS).map_err(|source| HostError::Timing {
+        bundle: path.to_path_buf(),
+        source: Box::new(source),
+    })?;
+    let mut text = String::new();
+    for StageTime { graph, best_ms, median_ms } in times {
+        let _ = writeln!(
+            text,
+            "{indent}{graph:<10} {best_ms:>9.2} ms, median {median_ms:.2} ms of {REPETITIONS}"
+        );
+    }
+    Ok(text)
 }
 
 /// Everything the manifest says, for people.

@@ -10,14 +10,19 @@ mod replay;
 mod track;
 mod verify;
 
+<<<<<<< HEAD
 pub use replay::ReplayArgs;
 
+=======
+use crate::engine::EngineArgs;
+>>>>>>> 2feb4d1 (Programs take --engine; verify and check report every engine before they fail)
 use crate::error::HostError;
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
+use tsda_runtime::engine::EngineChoice;
 
 /// Tracks one target through frames of a visible and a thermal camera.
 #[derive(Debug, Parser)]
@@ -73,6 +78,9 @@ pub struct DemoArgs {
     /// Seed of the rendered clip
     #[arg(long, default_value_t = 7, conflicts_with = "data")]
     pub seed: u32,
+    /// Where the network runs
+    #[command(flatten)]
+    pub engine: EngineArgs,
 }
 
 /// Arguments of `tsda track`.
@@ -104,6 +112,9 @@ pub struct TrackArgs {
     /// Sensor of a Y4M stream, instead of guessing from its colours
     #[arg(long, value_name = "rgb|thermal", value_parser = parse_modality)]
     pub modality: Option<tsda_runtime::Modality>,
+    /// Where the network runs
+    #[command(flatten)]
+    pub engine: EngineArgs,
 }
 
 /// Arguments of `tsda info`.
@@ -112,6 +123,9 @@ pub struct InfoArgs {
     /// Bundle; without it, the embedded one
     #[arg(value_name = "FILE.tsda")]
     pub bundle: Option<PathBuf>,
+    /// Also what this engine is and how long each graph takes on it (docs/engines.md)
+    #[arg(long, value_name = "ENGINE")]
+    pub engine: Option<EngineChoice>,
 }
 
 /// Arguments of `tsda verify`.
@@ -123,6 +137,9 @@ pub struct VerifyArgs {
     /// Largest absolute difference allowed
     #[arg(long, default_value_t = 1e-4)]
     pub tolerance: f32,
+    /// Only this engine (docs/engines.md) [default: every one of this build that is on the machine]
+    #[arg(long, value_name = "ENGINE")]
+    pub engine: Option<EngineChoice>,
 }
 
 /// Arguments of `tsda eval`.
@@ -147,6 +164,10 @@ pub struct EvalArgs {
     /// Sequences tracked at a time
     #[arg(long, default_value_t = 1)]
     pub threads: usize,
+    /// Where the network runs: tract, ort, ort:cuda or ort:tensorrt, with options after commas such
+    /// as ort,threads=2 (docs/engines.md)
+    #[arg(long, value_name = "ENGINE", default_value_t)]
+    pub engine: EngineChoice,
     /// Frames per clip made from stills
     #[arg(long, value_name = "N", default_value_t = 60)]
     pub pseudo_frames: usize,

@@ -18,7 +18,7 @@ pub(super) fn run(args: &TrackArgs) -> Result<u8, HostError> {
     let (init, from) = first_box(args)?;
     let truth = args.truth.as_deref().map(read_boxes).transpose()?.unwrap_or_default();
     let bundle = model::load(args.bundle.as_deref())?;
-    let mut tracker = model::tracker(&bundle)?;
+    let mut tracker = model::tracker_on(&bundle, &args.engine.choice()?)?;
 
     let total = source.len_hint();
     let mut sinks: Vec<Box<dyn Sink>> = vec![Box::new(BoxesFile::create(&args.out)?)];

@@ -1,11 +1,11 @@
 //! `tsda verify`: does this board compute what the trainer's network computed?
 
 use super::VerifyArgs;
-use crate::error::{EXIT_CHECK_FAILED, EXIT_OK, HostError};
+use super::info::stage_table;
+use crate::error::{EXIT_CHECK_FAILED, EXIT_OK, HostError, one_line};
 use crate::model;
-use std::time::Instant;
-use tsda_runtime::Engine;
 use tsda_runtime::bundle::{BundleFile, SectionKind};
+use tsda_runtime::engine::{AnyEngine, EngineChoice};
 use tsda_runtime::probe::{self, Probe};
 
 pub(super) fn run(args: &VerifyArgs) -> Result<u8, HostError> {
@@ -29,29 +29,49 @@ pub(super) fn run(args: &VerifyArgs) -> Result<u8, HostError> {
         args.tolerance
     );
     println!("{:<8} {:>9} {:>12} {:>12} {:>9}", "engine", "templates", "score map", "ltrb map", "");
-    let mut good = true;
-    let mut engine = model::engine(&file, &bundle)?;
-    good &= check(&file, &mut engine, &probe, args.tolerance)?;
-    #[cfg(feature = "ort")]
-    {
-        let mut engine = model::ort_engine(&file, &bundle)?;
-        good &= check(&file, &mut engine, &probe, args.tolerance)?;
+    let choices = args.engine.clone().map_or_else(EngineChoice::compiled, |choice| vec![choice]);
+    let (mut good, mut failed, mut checked) = (true, None, Vec::new());
+    let mut times = String::new();
+    // One engine that cannot be had must not hide what the others compute.
+    for choice in &choices {
+        let outcome = model::engine(&file, &bundle, choice).and_then(|mut engine| {
+            good &= check(&file, &mut engine, &probe, args.tolerance)?;
+            times += &stage_table(file.path(), &mut engine, &format!("{choice:<8} "))?;
+            Ok(())
+        });
+        match outcome {
+            Ok(()) => checked.push(choice.to_string()),
+            Err(HostError::Engine { source, .. }) if args.engine.is_none() && source.is_unasked() => {
+                println!("{choice:<8} not checked: {source}");
+            }
+            Err(e) => {
+                println!("{choice:<8} FAILED: {}", one_line(&e));
+                failed = failed.or(Some(e));
+            }
+        }
     }
-    println!(
-        "{}",
-        if good { "ok" } else { "FAILED: this engine does not compute what was trained" }
-    );
-    Ok(if good { EXIT_OK } else { EXIT_CHECK_FAILED })
+    print!("{times}");
+    if !good {
+        println!("FAILED: an engine does not compute what was trained");
+        return Ok(EXIT_CHECK_FAILED);
+    }
+    match failed {
+        Some(e) => Err(e),
+        None => {
+            println!("{}: ok", checked.join(", "));
+            Ok(EXIT_OK)
+        }
+    }
 }
 
-fn check<E: Engine>(
+fn check(
     file: &BundleFile,
-    engine: &mut E,
+    engine: &mut AnyEngine,
     probe: &Probe<'_>,
     tolerance: f32,
 ) -> Result<bool, HostError> {
+    use tsda_runtime::Engine as _;
     let name = engine.name();
-    let start = Instant::now();
     let report = probe::run(engine, probe).map_err(|source| HostError::ProbeRun {
         bundle: file.path().to_path_buf(),
         source: Box::new(source),
@@ -69,6 +89,5 @@ fn check<E: Engine>(
             if fits { "ok" } else { "TOO LARGE" }
         );
     }
-    println!("{name:<8} took {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     Ok(good)
 }

@@ -1,7 +1,7 @@
 //! Any single graph on ONNX Runtime: fixed shapes, f32, all tensors bound once. For checks; the
 //! tracker's engine is [`super::OrtEngine`].
 
-use super::{EngineError, Stage, bind, environment, error, read, write, zeros};
+use super::{EngineError, OrtLibrary, Stage, bind, error, read, write, zeros};
 use crate::bundle::SectionKind;
 use ::ort::session::{IoBinding, Session};
 use ::ort::value::{Outlet, Tensor, ValueType};
@@ -24,7 +24,7 @@ impl GraphSession {
     /// When the library cannot be loaded, it refuses the graph, or a shape is not fixed.
     pub fn new(onnx: &[u8], threads: usize) -> Result<Self, EngineError> {
         let failed = |e: &dyn core::fmt::Display| error(Stage::Load, format_args!("{e}"));
-        let session = Session::builder(environment()?)
+        let session = Session::builder(&OrtLibrary::get()?.environment)
             .map_err(|e| failed(&e))?
             .with_intra_threads(threads)
             .map_err(|e| failed(&e))?
