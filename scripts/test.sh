@@ -1,17 +1,18 @@
 #!/usr/bin/env bash
 # Runs every test of the workspace. Where Python is found, the packages that check our ONNX files
-# from outside (onnx, onnxruntime) are installed once into target/py; without Python or network the
-# tests that need them say "skipped" and the rest runs all the same.
+# from outside (onnx, onnxruntime) are installed once into target/py, and the ONNX Runtime library
+# among them serves the tests of our own ONNX Runtime engine; without Python or network the tests
+# that need them say "skipped" and the rest runs all the same.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 target="${CARGO_TARGET_DIR:-target}"
 venv="$target/py"
-want="onnx>=1.17 onnxruntime>=1.20 numpy"
+want="onnx>=1.17 onnxruntime>=1.20 numpy pillow"
 
 prepare_python() {
   command -v python3 >/dev/null || { echo "python3 not found: the ONNX checks from Python are skipped"; return 1; }
-  if [ -x "$venv/bin/python" ] && "$venv/bin/python" -c 'import onnx, onnxruntime, numpy' 2>/dev/null; then
+  if [ -x "$venv/bin/python" ] && "$venv/bin/python" -c 'import onnx, onnxruntime, numpy, PIL' 2>/dev/null; then
     return 0
   fi
   mkdir -p "$target"
@@ -24,6 +25,13 @@ prepare_python() {
 if prepare_python; then
   TSDA_PYTHON="$(cd "$(dirname "$venv")" && pwd)/py/bin/python"
   export TSDA_PYTHON
+  if [ -z "${TSDA_ORT_LIB:-}" ]; then
+    TSDA_ORT_LIB="$(find "$venv/lib" -path '*/onnxruntime/capi/libonnxruntime.so.*' | sort | tail -n 1)"
+    if [ -n "$TSDA_ORT_LIB" ]; then
+      TSDA_ORT_LIB="$(cd "$(dirname "$TSDA_ORT_LIB")" && pwd)/$(basename "$TSDA_ORT_LIB")"
+      export TSDA_ORT_LIB
+    fi
+  fi
 fi
 
 log="$target/test.log"

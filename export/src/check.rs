@@ -100,7 +100,11 @@ impl std::fmt::Display for CheckReport {
             writeln!(f, "{engine:<8} {graph:<10} {ms:>12.2}")?;
         }
         for Unchecked { engine, error, unasked } in &self.unchecked {
-            writeln!(f, "{engine:<8} {}: {error}", if *unasked { "not checked" } else { "FAILED" })?;
+            writeln!(
+                f,
+                "{engine:<8} {}: {error}",
+                if *unasked { "not checked" } else { "FAILED" }
+            )?;
         }
         Ok(())
     }

@@ -23,9 +23,9 @@ mod timing;
 use crate::engine::{Engine, EngineError};
 use crate::geometry::BBox;
 pub use crate::labels::template_maps;
+use crate::spec::{MAX_TEMPLATES, ModelSpec};
 #[cfg(feature = "std")]
 pub use timing::{StageTime, stage_times};
-use crate::spec::{MAX_TEMPLATES, ModelSpec};
 
 /// First bytes of the section.
 const MAGIC: [u8; 4] = *b"PRB1";

@@ -34,18 +34,21 @@ pub(super) fn run(args: &VerifyArgs) -> Result<u8, HostError> {
     let mut times = String::new();
     // One engine that cannot be had must not hide what the others compute.
     for choice in &choices {
+        let name = choice.to_string();
         let outcome = model::engine(&file, &bundle, choice).and_then(|mut engine| {
             good &= check(&file, &mut engine, &probe, args.tolerance)?;
-            times += &stage_table(file.path(), &mut engine, &format!("{choice:<8} "))?;
+            times += &stage_table(file.path(), &mut engine, &format!("{name:<8} "))?;
             Ok(())
         });
         match outcome {
-            Ok(()) => checked.push(choice.to_string()),
-            Err(HostError::Engine { source, .. }) if args.engine.is_none() && source.is_unasked() => {
-                println!("{choice:<8} not checked: {source}");
+            Ok(()) => checked.push(name),
+            Err(HostError::Engine { source, .. })
+                if args.engine.is_none() && source.is_unasked() =>
+            {
+                println!("{name:<8} not checked: {source}");
             }
             Err(e) => {
-                println!("{choice:<8} FAILED: {}", one_line(&e));
+                println!("{name:<8} FAILED: {}", one_line(&e));
                 failed = failed.or(Some(e));
             }
         }

@@ -23,7 +23,7 @@ pub use options::{Optimisation, OrtOptions, Provider};
 use super::{Engine, EngineError, Maps, Stage, TemplateInput, slot_shape};
 use crate::bundle::{Bundle, SectionKind, WEIGHTS_FILE};
 use crate::spec::ModelSpec;
-use ::ort::memory::{AllocatorType, Allocator, MemoryInfo, MemoryType};
+use ::ort::memory::{Allocator, AllocatorType, MemoryInfo, MemoryType};
 use ::ort::session::{IoBinding, Session};
 use ::ort::value::{Outlet, Tensor, ValueType};
 use std::path::PathBuf;

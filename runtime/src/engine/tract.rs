@@ -195,11 +195,16 @@ impl Graph {
                 error(Stage::Load, format_args!("{kind}, tensor `{name}`: {reason}"))
             })?;
         }
+        let depthwise = graph.node.iter().any(is_grouped_conv);
         let names = |ports: &[Port]| ports.iter().map(|p| p.name.clone()).collect::<Vec<_>>();
         let prepare = || {
             let mut model = onnx().model_for_proto_model(&proto)?;
             model.set_input_names(names(inputs))?;
             model.select_outputs_by_name(names(outputs))?;
+            let mut model = model.into_typed()?.into_decluttered()?;
+            if depthwise {
+                channels_last(&mut model)?;
+            }
             model.into_optimized()?.into_runnable()
         };
         let plan = prepare().map_err(failed)?;
@@ -271,6 +276,23 @@ fn sides(declared: &type_proto::Tensor) -> Vec<i64> {
         _ => -1,
     })
     .collect()
+}
+
+
+/// A convolution of several groups; in the networks of this family, one per channel.
+fn is_grouped_conv(node: &pb::NodeProto) -> bool {
+    node.op_type == "Conv" && node.attribute.iter().any(|a| a.name == "group" && a.i > 1)
+}
+
+/// Lets convolutions run with the channels innermost. tract's depthwise kernel walks one plane after
+/// the other, a few dozen cells each; with the channels innermost it computes whole vectors, which
+/// saves a third of the time of `features` on mobile backbones. ResNets gain nothing from it.
+fn channels_last(model: &mut TypedModel) -> TractResult<()> {
+    let name = "conv_nhwc";
+    match tract_onnx::tract_core::transform::get_transform(name)? {
+        Some(transform) => transform.transform(model),
+        None => Err(TractError::msg(format!("this tract has no transformation {name}"))),
+    }
 }
 
 /// Do the graph's declared inputs or outputs have the names and shapes they need?

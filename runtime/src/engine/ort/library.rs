@@ -137,7 +137,7 @@ impl OrtLibrary {
         } else {
             asked
         };
-        let builder = ::ort::init_from(&asked).map_err(|e| failed(e.to_string()))?;
+        let builder = ::ort::init_from(&asked).map_err(|e| failed(with_cause(&e)))?;
         let environment = builder
             .with_name("tsda")
             .with_telemetry(false)
@@ -178,6 +178,16 @@ impl OrtLibrary {
             library: self.path.clone(),
         })
     }
+}
+
+/// The message, and what the system's loader said.
+fn with_cause(error: &::ort::LoadDynamicError) -> String {
+    use std::error::Error as _;
+    let cause = match error {
+        ::ort::LoadDynamicError::Dlopen { error, .. } => error.source(),
+        _ => None,
+    };
+    cause.map_or_else(|| error.to_string(), |cause| format!("{error}: {cause}"))
 }
 
 /// The real file behind what was asked for: links resolved, the system's search path looked up in

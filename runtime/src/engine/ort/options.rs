@@ -265,22 +265,27 @@ mod tests {
     fn the_written_form_is_read_back() {
         for (text, want) in [
             ("", OrtOptions::default()),
-            (":cuda,device=1", OrtOptions {
-                provider: Provider::Cuda,
-                device: 1,
-                ..OrtOptions::default()
-            }),
-            (",threads=0,opt=basic", OrtOptions {
-                threads: 0,
-                optimisation: Optimisation::Basic,
-                ..OrtOptions::default()
-            }),
-            (":tensorrt,fp16,cache=a/b", OrtOptions {
-                provider: Provider::TensorRt,
-                fp16: true,
-                cache: Some("a/b".into()),
-                ..OrtOptions::default()
-            }),
+            (
+                ":cuda,device=1",
+                OrtOptions { provider: Provider::Cuda, device: 1, ..OrtOptions::default() },
+            ),
+            (
+                ",threads=0,opt=basic",
+                OrtOptions {
+                    threads: 0,
+                    optimisation: Optimisation::Basic,
+                    ..OrtOptions::default()
+                },
+            ),
+            (
+                ":tensorrt,fp16,cache=a/b",
+                OrtOptions {
+                    provider: Provider::TensorRt,
+                    fp16: true,
+                    cache: Some("a/b".into()),
+                    ..OrtOptions::default()
+                },
+            ),
         ] {
             let read = OrtOptions::parse(text).unwrap();
             assert_eq!(read, want, "{text}");

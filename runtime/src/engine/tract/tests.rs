@@ -11,7 +11,8 @@ use crate::tracker::Tracker;
 use crate::{BBox, FrameView};
 use prost::Message as _;
 
-pub(in crate::engine) const SPEC: ModelSpec = ModelSpec { crop: 48, width: 4, heads: 1, ..ModelSpec::NANO };
+pub(in crate::engine) const SPEC: ModelSpec =
+    ModelSpec { crop: 48, width: 4, heads: 1, ..ModelSpec::NANO };
 const SIDE: usize = 3;
 const CELLS: usize = SIDE * SIDE;
 
