@@ -13,6 +13,7 @@ pub const LIBRARY_VARIABLES: [&str; 2] = ["TSDA_ORT_LIB", "ORT_DYLIB_PATH"];
 /// An engine on ONNX Runtime that could not be made.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
+#[expect(clippy::large_enum_variant, reason = "an engine's message is inside, and errors are rare")]
 pub enum OrtError {
     /// There is no usable library.
     #[error(
