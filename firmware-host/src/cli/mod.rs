@@ -10,12 +10,9 @@ mod replay;
 mod track;
 mod verify;
 
-<<<<<<< HEAD
 pub use replay::ReplayArgs;
 
-=======
 use crate::engine::EngineArgs;
->>>>>>> 2feb4d1 (Programs take --engine; verify and check report every engine before they fail)
 use crate::error::HostError;
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
