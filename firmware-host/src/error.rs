@@ -109,6 +109,9 @@ pub enum HostError {
     /// A script that cannot be replayed.
     #[error(transparent)]
     Replay(#[from] crate::replay::ReplayError),
+    /// A TraX session could not go on.
+    #[error(transparent)]
+    Trax(#[from] crate::trax::TraxError),
     /// An evaluation could not be finished.
     #[error("evaluation: {0}")]
     Eval(#[source] Box<dyn std::error::Error + Send + Sync>),
@@ -131,12 +134,14 @@ impl HostError {
             | Self::Create { .. } => EXIT_BAD_INPUT,
             // The choice of engine is the user's.
             Self::Engine { source, .. } if source.is_absent() => EXIT_BAD_INPUT,
+            Self::Trax(e) if e.is_input() => EXIT_BAD_INPUT,
             Self::Write { .. }
             | Self::Encode { .. }
             | Self::Tracker { .. }
             | Self::Engine { .. }
             | Self::Timing { .. }
             | Self::ProbeRun { .. }
+            | Self::Trax(_)
             | Self::Eval(_)
             | Self::Interrupted => EXIT_RUNTIME,
         }

@@ -8,7 +8,8 @@
 //! 3. [`track`]: drives a tracker on any engine through a source into outputs.
 //! 4. [`video`]: GIF, page, PNG files, strip; [`metrics`]: figures against known boxes.
 //! 5. [`replay`]: scripted runs, to check the tracker frame by frame.
-//! 6. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
+//! 6. [`trax`]: sessions with the VOT toolkit.
+//! 7. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
 //!    appear whole or not at all.
 
 pub mod cli;
@@ -23,4 +24,5 @@ pub mod render;
 pub mod replay;
 pub mod sequence;
 pub mod track;
+pub mod trax;
 pub mod video;

@@ -1,6 +1,7 @@
 //! `tsda`: track a target through frames of two sensors.
 
 use clap::Parser as _;
+use std::io::Write as _;
 use std::process::ExitCode;
 use tsda_host::cli::{Cli, execute};
 use tsda_host::error::one_line;
@@ -10,7 +11,8 @@ fn main() -> ExitCode {
     match execute(&Cli::parse()) {
         Ok(code) => ExitCode::from(code),
         Err(e) => {
-            eprintln!("tsda: {}", one_line(&e));
+            // Whoever started this program may have closed the other end; that is no panic.
+            let _ = writeln!(std::io::stderr(), "tsda: {}", one_line(&e));
             ExitCode::from(e.exit_code())
         }
     }

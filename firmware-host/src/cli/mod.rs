@@ -6,11 +6,15 @@ mod devices;
 #[cfg(feature = "eval")]
 mod eval;
 mod info;
+mod render;
 mod replay;
 mod track;
+mod trax;
 mod verify;
 
+pub use render::RenderArgs;
 pub use replay::ReplayArgs;
+pub use trax::TraxArgs;
 
 use crate::engine::EngineArgs;
 use crate::error::HostError;
@@ -51,6 +55,11 @@ pub enum Command {
     /// Evaluate a bundle on a dataset under cross-modal protocols
     #[cfg(feature = "eval")]
     Eval(EvalArgs),
+    /// Serve the VOT toolkit, or any other TraX client, over standard input and output or a socket
+    Trax(TraxArgs),
+    /// Write clips drawn by the program as sequences of the VOT toolkit
+    #[command(hide = true)]
+    Render(RenderArgs),
     /// List V4L2 cameras and their formats
     #[cfg(feature = "camera")]
     Devices,
@@ -191,6 +200,8 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Replay(args) => replay::run(args),
         #[cfg(feature = "eval")]
         Command::Eval(args) => eval::run(args),
+        Command::Trax(args) => trax::run(args),
+        Command::Render(args) => render::run(args),
         #[cfg(feature = "camera")]
         Command::Devices => devices::run(),
     }

@@ -3,6 +3,8 @@
 use super::{SourceError, modality};
 use crate::picture::Picture;
 use image::{DynamicImage, ImageReader};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 use tsda_runtime::{FrameView, Modality, PixelFormat};
 
@@ -32,19 +34,55 @@ impl Decoded {
     /// # Errors
     /// Names the file when it cannot be read, is no picture, or is damaged.
     pub fn open(path: &Path) -> Result<Self, SourceError> {
-        let io = |source| SourceError::Io { path: path.to_path_buf(), source };
-        let bad = |reason: String| SourceError::Decode { path: path.to_path_buf(), reason };
-        let bytes = std::fs::read(path).map_err(io)?;
-        if bytes.is_empty() {
-            return Err(bad("the file is empty".into()));
-        }
-        let image = ImageReader::new(std::io::Cursor::new(&bytes))
-            .with_guessed_format()
-            .map_err(io)?
-            .decode()
-            .map_err(|e| bad(e.to_string()))?;
+        let bytes = std::fs::read(path)
+            .map_err(|source| SourceError::Io { path: path.to_path_buf(), source })?;
+        Self::from_bytes(&bytes, path)
+    }
+
+    /// Decodes the content of a picture file; errors call it `name`.
+    ///
+    /// # Errors
+    /// When it is no picture, or damaged.
+    pub fn from_bytes(bytes: &[u8], name: &Path) -> Result<Self, SourceError> {
+        let bad = |reason: String| SourceError::Decode { path: name.to_path_buf(), reason };
+        let image = reader(Cursor::new(bytes), name)?.decode().map_err(|e| bad(e.to_string()))?;
         Self::from_image(image)
-            .map_err(|source| SourceError::Frame { name: path.display().to_string(), source })
+            .map_err(|source| SourceError::Frame { name: name.display().to_string(), source })
+    }
+
+    /// A raw 16-bit picture of `2 * width * height` bytes, little endian.
+    ///
+    /// # Errors
+    /// When a side is zero or the buffer too short.
+    pub fn sixteen(
+        width: usize,
+        height: usize,
+        data: Vec<u8>,
+    ) -> Result<Self, tsda_runtime::FrameError> {
+        let (values, _) = data.as_chunks::<2>();
+        let raw: Vec<u16> = values.iter().map(|v| u16::from_le_bytes(*v)).collect();
+        let (low, high) = shown_range(&raw);
+        let decoded = Self::Sixteen { width, height, low, high, data };
+        decoded.view()?;
+        Ok(decoded)
+    }
+
+    /// Width and height of a picture file, read from its header.
+    ///
+    /// # Errors
+    /// Names the file when it cannot be read or does not begin like a picture.
+    pub fn size_of_file(path: &Path) -> Result<(usize, usize), SourceError> {
+        let file = File::open(path)
+            .map_err(|source| SourceError::Io { path: path.to_path_buf(), source })?;
+        size(reader(BufReader::new(file), path)?, path)
+    }
+
+    /// Width and height of the content of a picture file; errors call it `name`.
+    ///
+    /// # Errors
+    /// When it does not begin like a picture.
+    pub fn size_of_bytes(bytes: &[u8], name: &Path) -> Result<(usize, usize), SourceError> {
+        size(reader(Cursor::new(bytes), name)?, name)
     }
 
     fn from_image(image: DynamicImage) -> Result<Self, tsda_runtime::FrameError> {
@@ -95,6 +133,26 @@ impl Decoded {
             Self::Sixteen { .. } => Modality::Thermal,
         })
     }
+}
+
+/// A reader for the format that the content shows.
+fn reader<R: BufRead + Seek>(mut input: R, name: &Path) -> Result<ImageReader<R>, SourceError> {
+    let io = |source| SourceError::Io { path: name.to_path_buf(), source };
+    if input.fill_buf().map_err(io)?.is_empty() {
+        let reason = "the file is empty".into();
+        return Err(SourceError::Decode { path: name.to_path_buf(), reason });
+    }
+    ImageReader::new(input).with_guessed_format().map_err(io)
+}
+
+fn size<R: BufRead + Seek>(
+    reader: ImageReader<R>,
+    name: &Path,
+) -> Result<(usize, usize), SourceError> {
+    let (width, height) = reader
+        .into_dimensions()
+        .map_err(|e| SourceError::Decode { path: name.to_path_buf(), reason: e.to_string() })?;
+    Ok((width as usize, height as usize))
 }
 
 /// First and last percentile of the raw values: a few dead or burning pixels do not set the scale.

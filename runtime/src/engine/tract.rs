@@ -278,7 +278,6 @@ fn sides(declared: &type_proto::Tensor) -> Vec<i64> {
     .collect()
 }
 
-
 /// A convolution of several groups; in the networks of this family, one per channel.
 fn is_grouped_conv(node: &pb::NodeProto) -> bool {
     node.op_type == "Conv" && node.attribute.iter().any(|a| a.name == "group" && a.i > 1)
