@@ -115,15 +115,15 @@ impl Subject {
             Variant::simplified("as written", self.written(count)?),
             Variant::simplified(
                 "template tokens kept (4.2)",
-                self.from_tokens(count, Rearranged::default())?,
+                self.with_tokens(count, Rearranged::default())?,
             ),
             Variant::simplified(
                 "second row without mask (4.3.1, 2)",
-                self.from_tokens(count, both)?,
+                self.with_tokens(count, both)?,
             ),
             Variant::simplified(
                 "decoder in memory space (4.3.3, 4)",
-                self.from_tokens(count, decoder)?,
+                self.with_tokens(count, decoder)?,
             ),
             Variant::new("one product for q, k, v (4.2)", self.exported(SlotForm::Tokens, kind)?),
             Variant::new(
@@ -150,7 +150,7 @@ impl Subject {
         })
     }
 
-    fn from_tokens(&self, count: u8, with: Rearranged) -> Result<Graph, ExportError> {
+    fn with_tokens(&self, count: u8, with: Rearranged) -> Result<Graph, ExportError> {
         let (cells, d) = (self.spec.cells(), usize::from(self.spec.width));
         record("predict", "", |r| {
             let tokens = (0..count)

@@ -82,9 +82,9 @@ pub struct Figure<'a> {
 pub enum SectionKind {
     /// ONNX graph crop -> head feature; its weights are external data in [`SectionKind::Weights`].
     FeaturesOnnx,
-    /// ONNX graph head feature, label, ltrb -> template tokens.
+    /// ONNX graph head feature, label, ltrb -> what a template slot keeps.
     TemplateOnnx,
-    /// ONNX graph tokens of this many templates, search feature -> score map, ltrb map.
+    /// ONNX graph slots of this many templates, search feature -> score map, ltrb map.
     PredictOnnx(u8),
     /// Raw little-endian tensors, each 64-byte aligned; the graphs' external data.
     Weights,
