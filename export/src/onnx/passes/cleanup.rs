@@ -2,6 +2,7 @@
 
 use super::super::graph::{Attribute, Data, Graph, Node, ValueId};
 use std::collections::HashMap;
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 
 /// Removes reshapes, expansions, transpositions, slices and arithmetic that change nothing, and
 /// joins chains of reshapes and of transpositions.
@@ -174,17 +175,37 @@ fn broadcast_dims(a: &[usize], b: &[usize]) -> Option<Vec<usize>> {
         .collect()
 }
 
-/// Computes equal expressions once. Small equal constants count as the same input.
+/// Computes equal expressions once, and keeps equal constants once.
 pub(super) fn join_equal(graph: &mut Graph) -> bool {
-    let mut constants: HashMap<String, ValueId> = HashMap::new();
-    let mut same: HashMap<ValueId, ValueId> = HashMap::new();
+    let constants = join_constants(graph);
+    join_nodes(graph) | constants
+}
+
+fn join_constants(graph: &mut Graph) -> bool {
+    let mut kept: HashMap<(Vec<usize>, u64), Vec<ValueId>> = HashMap::new();
+    let mut joined = Vec::new();
     for id in graph.initialisers() {
-        let (dims, data) = (graph.dims(id), graph.constant(id));
-        if let Some(data) = data.filter(|d| d.len() <= 16) {
-            let first = *constants.entry(format!("{dims:?} {data:?}")).or_insert(id);
-            same.insert(id, first);
+        let Some(data) = graph.constant(id) else { continue };
+        let mut hasher = DefaultHasher::new();
+        match data {
+            Data::F32(v) => v.iter().for_each(|v| v.to_bits().hash(&mut hasher)),
+            Data::I64(v) => v.hash(&mut hasher),
+            Data::Bool(v) => v.hash(&mut hasher),
+        }
+        let alike = kept.entry((graph.dims(id).to_vec(), hasher.finish())).or_default();
+        match alike.iter().find(|first| graph.constant(**first).is_some_and(|d| d.same_as(data))) {
+            Some(first) => joined.push((id, *first)),
+            None => alike.push(id),
         }
     }
+    for (later, first) in &joined {
+        graph.redirect(*later, *first);
+    }
+    !joined.is_empty()
+}
+
+fn join_nodes(graph: &mut Graph) -> bool {
+    let mut same: HashMap<ValueId, ValueId> = HashMap::new();
     let mut seen: HashMap<String, ValueId> = HashMap::new();
     let mut joined = Vec::new();
     for node in &graph.nodes {
