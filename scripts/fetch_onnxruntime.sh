@@ -63,7 +63,7 @@ command -v "$python" >/dev/null || { say "$python not found: install Python 3, o
 
 mkdir -p "$dir"
 work="$(mktemp -d "$dir/fetch.XXXXXX")"
-trap 'rm -rf "$work"' EXIT
+trap 'rm -rf "$work"; rmdir "$dir" 2>/dev/null || true' EXIT
 say "downloading $package${version:+ $version} for $(uname -m)"
 if ! "$python" -m pip download --quiet --no-deps --only-binary=:all: --dest "$work" \
   "$package${version:+==$version}" >&2; then

@@ -383,7 +383,7 @@ fn empty() -> Manifest<'static> {
     }
 }
 
-/// A missing library is an error, not a panic.
+/// A missing library is an error, not a panic, and does not hide what tract computes.
 #[cfg(feature = "ort")]
 #[test]
 fn a_missing_onnx_runtime_is_named() {
@@ -395,4 +395,16 @@ fn a_missing_onnx_runtime_is_named() {
     let text = String::from_utf8_lossy(&out.stderr).into_owned();
     assert_eq!(out.status.code(), Some(2), "{text}");
     assert!(text.contains("libabsent.so") && text.contains("TSDA_ORT_LIB"), "{text}");
+    let shown = String::from_utf8_lossy(&out.stdout).into_owned();
+    assert!(shown.contains("tract    predict1") && shown.contains("ort      FAILED"), "{shown}");
+    // By its name, alone: nothing else is checked, and tract needs no library.
+    let out = tool()
+        .args(["check", "--engine", "tract"])
+        .arg(&path)
+        .env("TSDA_ORT_LIB", &absent)
+        .output()
+        .unwrap();
+    let shown = String::from_utf8_lossy(&out.stdout).into_owned();
+    assert_eq!(out.status.code(), Some(0), "{shown}");
+    assert!(!shown.contains("ort "), "{shown}");
 }

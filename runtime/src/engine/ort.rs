@@ -292,7 +292,7 @@ impl Loader<'_> {
         let mut builder =
             builder.with_execution_providers(providers).map_err(|e| OrtError::Start {
                 provider: options.provider,
-                reason: e.to_string(),
+                reason: e.to_string().trim().to_owned(),
                 version: self.library.version().to_owned(),
                 library: self.library.path().to_owned(),
             })?;
