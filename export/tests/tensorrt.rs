@@ -10,11 +10,11 @@ use tsda_export::network;
 use tsda_runtime::bundle::{Bundle, BundleFile, SectionKind, WEIGHTS_FILE};
 use tsda_runtime::{Backbone, ModelSpec};
 
-/// The opset docs/onnx.md names. TensorRT 10 reads 9 to 20 and later ones.
+/// The opset docs/onnx.md names. TensorRT 10.0 reads 9 to 20, 10.15 reads 9 to 24.
 const OPSET: i64 = 17;
 
-/// Operators of our converter's output that TensorRT 10's parser takes for f32 (its operator table,
-/// `docs/operators.md` of onnx-tensorrt, versions 9.2 to 10).
+/// Operators of our converter's output that TensorRT's ONNX parser takes for f32: in its operator
+/// table (`docs/operators.md` of onnx-tensorrt) of both TensorRT 9.2 and 10.15.
 const TENSORRT: &[&str] = &[
     "Abs",
     "Add",
@@ -140,9 +140,12 @@ fn fixed_shape(info: &pb::ValueInfoProto) -> Result<Vec<i64>, String> {
 fn shapes_are_fixed_and_operators_known() {
     let mut used = BTreeSet::new();
     let resnet = resnet();
-    for (name, files) in
-        [("shipped nano", shipped()), ("nano", fresh(&ModelSpec::NANO)), ("resnet", fresh(&resnet))]
-    {
+    for (name, files) in [
+        ("shipped nano", shipped()),
+        ("nano", fresh(&ModelSpec::NANO)),
+        ("small", fresh(&ModelSpec::SMALL)),
+        ("resnet", fresh(&resnet)),
+    ] {
         let weights = files.iter().find(|(kind, _)| *kind == SectionKind::Weights);
         let weights = &weights.expect("weights").1;
         let mut graphs = 0;
@@ -162,9 +165,24 @@ fn shapes_are_fixed_and_operators_known() {
                 let shape = fixed_shape(info);
                 assert!(shape.is_ok(), "{at}: `{}`: {shape:?}", info.name);
             }
+            let constant: BTreeSet<&str> =
+                graph.initializer.iter().map(|tensor| tensor.name.as_str()).collect();
             for node in &graph.node {
                 assert!(node.domain.is_empty(), "{at}: `{}` is of {}", node.name, node.domain);
                 used.insert(node.op_type.clone());
+                // What the table restricts: further outputs of poolings and norms, dilated
+                // poolings, and whatever describes a shape must be known when the engine is built.
+                assert_eq!(node.output.len(), 1, "{at}: `{}`", node.name);
+                let described = ["Reshape", "Slice", "ReduceSum", "Expand", "Pad", "Tile", "Clip"];
+                if described.contains(&node.op_type.as_str()) {
+                    let open = node.input[1..].iter().find(|i| !constant.contains(i.as_str()));
+                    assert!(open.is_none(), "{at}: `{}` depends on {open:?}", node.name);
+                }
+                if node.op_type == "MaxPool" {
+                    let dilations = node.attribute.iter().find(|a| a.name == "dilations");
+                    let plain = dilations.is_none_or(|a| a.ints.iter().all(|&d| d == 1));
+                    assert!(plain, "{at}: `{}` is dilated", node.name);
+                }
             }
             // What lies between inputs and outputs follows from them: no side is left open.
             for tensor in &mut graph.initializer {
