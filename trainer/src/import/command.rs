@@ -150,6 +150,8 @@ pub fn run(options: &ImportOptions) -> Result<ImportSummary, WeightsError> {
             ..ModelSpec::NANO
         };
         (None, Some(backbone), BACKBONE, spec)
+    } else if !file.dict.names().any(|name| name.starts_with("head.")) {
+        return Err(WeightsError::NoHead { kind: kind.name(), path: input.clone() });
     } else {
         let stored = file.metadata.spec.as_ref();
         let found = infer::infer(&file.dict, constructor, stored, &options.given)?;

@@ -10,7 +10,7 @@ use crate::config::{ConfigError, ModelConfig};
 use tsda_runtime::{Backbone, ModelSpec, TrackerParams};
 
 /// Presets whose shapes files are compared with.
-const PRESETS: [&str; 3] = ["tomp101", "tomp50", "nano"];
+const PRESETS: [&str; 4] = ["tomp101", "tomp50", "nano", "small"];
 
 /// What the user says about the network.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -43,8 +43,8 @@ pub enum WeightsError {
         /// The file.
         path: PathBuf,
     },
-    /// The file is no safetensors file, or is cut short.
-    #[error("not a safetensors file, or damaged: {detail} ({})", path.display())]
+    /// The file is neither PyTorch's nor a safetensors file, or is cut short.
+    #[error("neither a PyTorch nor a safetensors file, or damaged: {detail} ({})", path.display())]
     Format {
         /// What the reader said.
         detail: String,
@@ -80,6 +80,17 @@ pub enum WeightsError {
     Unknown {
         /// Some of the names.
         names: Vec<String>,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A whole network was asked for, but the file has no head.
+    #[error(
+        "it holds no head, so it is no {kind} file; backbones are imported with --kind \
+         torchvision-resnet or efficientnet-lite0 ({})", path.display()
+    )]
+    NoHead {
+        /// `pytracking`, `full`.
+        kind: &'static str,
         /// The file.
         path: PathBuf,
     },

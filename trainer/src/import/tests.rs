@@ -125,7 +125,7 @@ fn a_backbone_comes_with_or_without_prefix() {
     let nano = Given::Preset("nano".into());
     let full = ImportOptions { kind: Some(ImportKind::Full), given: nano, ..options.clone() };
     let error = run(&full).unwrap_err();
-    assert!(matches!(error, WeightsError::Tensors { .. }), "{error}");
+    assert!(matches!(error, WeightsError::NoHead { .. }), "{error}");
     let kind = Some(ImportKind::EfficientNetLite0);
     let wrong = ImportOptions { kind, given: Given::Preset("tomp50".into()), ..options };
     let error = run(&wrong).unwrap_err();
@@ -324,6 +324,8 @@ fn torchvision_weights_are_a_backbone() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("resnet.safetensors");
     let input = torch_file("resnet.pth");
+    let whole = import(&input, &out, Some(ImportKind::Pytracking), Given::Nothing).unwrap_err();
+    assert!(matches!(whole, WeightsError::NoHead { .. }), "{whole}");
     let summary = import(&input, &out, None, Given::Nothing).unwrap();
     println!("{summary}");
     let backbone = Backbone::ResNet { base_channels: 1, blocks: [1, 2, 1] };
@@ -353,6 +355,32 @@ fn torchvision_weights_are_a_backbone() {
     assert!(matches!(error, WeightsError::Kind { .. }), "{error}");
     let error = import(&torch_file("traits.pth"), &out, None, Given::Nothing).unwrap_err();
     assert!(matches!(error, WeightsError::Unknown { .. }), "{error}");
+}
+
+#[test]
+fn training_starts_from_torchvision_weights_and_from_checkpoints() {
+    let theirs = |name: &str| StateDict::read(&torch_file(name)).unwrap();
+    let config = |init: &str| {
+        let text = format!(
+            "[model]\npreset = \"tomp50\"\ncrop = 64\nwidth = 8\nheads = 2\nfeed_forward = 4\n\
+             encoder_layers = 1\ndecoder_layers = 2\nltrb_hidden = 2\nfilter_size = 3\n\
+             backbone = {{ res_net = {{ base_channels = 1, blocks = [1, 2, 1] }} }}\n\
+             [[data]]\nkind = \"pairs\"\npath = \"pairs\"\n[init]\n{init}\n"
+        );
+        crate::config::Experiment::parse(&text, Path::new("c.toml")).unwrap()
+    };
+    let start = |init: &str| {
+        let net = crate::fit::initial_net(&config(init), &Device::flex().autodiff()).unwrap();
+        state_dict(&net.valid())
+    };
+    let path = |name: &str| torch_file(name).display().to_string();
+    let net = start(&format!("backbone = {:?}", path("resnet.pth")));
+    let dict = theirs("resnet.pth");
+    let backbone = net.iter().filter_map(|(n, t)| Some((n.strip_prefix(BACKBONE)?, t)));
+    assert_eq!(backbone.filter(|(n, t)| dict.get(n) == Some(*t)).count(), 80);
+    let net = start(&format!("weights = {:?}", path("pytracking.pth.tar")));
+    let dict = theirs("pytracking.pth.tar");
+    assert!(net.iter().all(|(name, tensor)| dict.get(name) == Some(tensor)));
 }
 
 /// A Python with torch, if there is one.
@@ -390,6 +418,7 @@ fn files_written_just_now_by_torch_are_read() {
     for (file, given, case, seq, test_embedding) in [
         ("small.pth.tar", Given::Nothing, "case_a", 0, true),
         ("small_no_test.pth.tar", Given::Nothing, "case_d", 2, false),
+        // Nothing but tensors: the heads are the configuration's.
         ("small_legacy.pth", given(None, Some(&config)).unwrap(), "case_a", 0, true),
     ] {
         let summary = import(&folder.path().join(file), &out, None, given).unwrap();
