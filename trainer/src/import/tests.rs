@@ -420,6 +420,9 @@ fn files_written_just_now_by_torch_are_read() {
         ("small_no_test.pth.tar", Given::Nothing, "case_d", 2, false),
         // Nothing but tensors: the heads are the configuration's.
         ("small_legacy.pth", given(None, Some(&config)).unwrap(), "case_a", 0, true),
+        // Or those of the preset whose shapes they have.
+        ("small_legacy.pth", Given::Nothing, "case_a", 0, true),
+        ("small_no_test_legacy.pth", Given::Preset("small".into()), "case_d", 2, false),
     ] {
         let summary = import(&folder.path().join(file), &out, None, given).unwrap();
         let spec = summary.network.unwrap().spec;
