@@ -345,8 +345,8 @@ impl Player<'_> {
         let memory = f.value("memory");
         let updated = f.flag("updated")?;
         if after.about_memory {
-            let expected = memory.is_some() || updated == Some(true);
-            compare.exact("updated", track.wrote_memory, Some(expected));
+            compare.exact("updated", track.wrote_memory, updated);
+            compare.exact("memory", track.wrote_memory, Some(memory.is_some()));
         }
         let Some(memory) = memory else { return Ok(()) };
         let mut m = Fields::new(memory, self.path, format!("{}, memory", f.at()))?;

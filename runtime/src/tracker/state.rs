@@ -93,9 +93,7 @@ pub struct Target {
 impl Target {
     /// From the annotated box (spec 3.2).
     pub(super) fn new(bbox: &BBox, spec: &ModelSpec) -> Self {
-        // The root in double precision, as the reference takes it: bit for bit its scale.
-        let area = (bbox.h * spec.search_factor) * (bbox.w * spec.search_factor);
-        let scale = libm::sqrt(f64::from(area)) as f32 / f32::from(spec.crop);
+        let scale = spec.search_factor * libm::sqrtf(bbox.w * bbox.h) / f32::from(spec.crop);
         Self {
             pos: position(bbox),
             size: Yx::new(bbox.h, bbox.w),

@@ -266,7 +266,7 @@ OTHER = TOMP | {
     "neighbourhood": 1.6,
     "displacement": 0.6,
     "write_confidence": 0.8,
-    "min_size": 6.25,
+    "min_size": 6.3,
     "max_scale_change": 1.3,
 }
 USUAL = [0.1, 0.1, 0.1, 0.1]
@@ -311,7 +311,7 @@ RUNS = [
         ],
     ),
     (
-        "odd_401x399", 401, 399, 9, 5.0, 1, TOMP | {"min_size": 21.0}, [150.0, 160.0, 210.0, 190.5],
+        "odd_401x399", 401, 399, 9, 5.0, 1, TOMP | {"min_size": 20.1}, [150.0, 160.0, 210.0, 190.5],
         [
             ([(4, 4, 0.95)], USUAL),
             ([(4, 3, 0.3)], USUAL),
