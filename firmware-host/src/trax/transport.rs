@@ -1,7 +1,6 @@
 //! The way to the client: pipes, or a port it listens on.
 
 use super::error::TraxError;
-use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, TcpStream};
@@ -27,11 +26,7 @@ impl Connection {
     /// # Errors
     /// Names the variable that cannot be followed.
     pub fn from_environment() -> Result<Self, TraxError> {
-        Self::open(|name| std::env::var_os(name))
-    }
-
-    fn open(variable: impl Fn(&'static str) -> Option<OsString>) -> Result<Self, TraxError> {
-        let get = |name| variable(name).map(|v| v.to_string_lossy().into_owned());
+        let get = |name| std::env::var_os(name).map(|v| v.to_string_lossy().into_owned());
         if let Some(value) = get("TRAX_SOCKET") {
             return Self::socket(&value);
         }
