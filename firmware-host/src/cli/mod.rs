@@ -1,5 +1,7 @@
 //! The command line: what was typed ([`Cli`]) and what it does ([`execute`]).
 
+#[cfg(feature = "eval")]
+mod data_check;
 mod demo;
 #[cfg(feature = "camera")]
 mod devices;
@@ -60,6 +62,9 @@ pub enum Command {
     /// Write clips drawn by the program as sequences of the VOT toolkit
     #[command(hide = true)]
     Render(RenderArgs),
+    /// Look through a dataset: counts, absences, resolutions, attributes, broken files
+    #[cfg(feature = "eval")]
+    DataCheck(data_check::DataCheckArgs),
     /// List V4L2 cameras and their formats
     #[cfg(feature = "camera")]
     Devices,
@@ -155,7 +160,8 @@ pub struct EvalArgs {
     /// Bundle to evaluate, instead of the embedded one
     #[arg(long, value_name = "FILE.tsda")]
     pub bundle: Option<PathBuf>,
-    /// sequences:PATH[@split] for clips, pseudo:PATH[@split] for clips made from registered stills
+    /// lasher:PATH, rgbt234:PATH, .. for benchmarks (`tsda data-check --help` lists all kinds),
+    /// pseudo:PATH[@split] for clips made from registered stills
     #[arg(long, value_name = "KIND:PATH[@SPLIT]")]
     pub dataset: String,
     /// rgb2t, t2rgb, switch:N, rgb or t; may be repeated [default: rgb2t t2rgb switch:20]
@@ -202,6 +208,8 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Eval(args) => eval::run(args),
         Command::Trax(args) => trax::run(args),
         Command::Render(args) => render::run(args),
+        #[cfg(feature = "eval")]
+        Command::DataCheck(args) => data_check::run(args),
         #[cfg(feature = "camera")]
         Command::Devices => devices::run(),
     }

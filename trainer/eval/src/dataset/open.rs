@@ -1,19 +1,48 @@
-//! `kind:path[@split]`: how configurations and command lines name a dataset.
-//!
-//! | kind | what |
-//! |---|---|
-//! | `pairs` | registered stills, one frame each ([`PairsDataset`]) |
-//! | `pseudo` | the same stills as clips, one per target ([`pseudo::clips`], default options) |
-//! | `sequences` | LasHeR-like clips ([`SequencesDataset`]) |
+//! `kind[/option..]:path[@split]`: how configurations and command lines name a dataset.
 
 use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
+use tsda_runtime::Modality;
+
+use super::layout::Jobs;
 use super::pairs::PairsDataset;
-use super::sequences::{SequenceFilter, SequencesDataset};
 use super::{DatasetError, Sequence};
+use super::{antiuav, lasher, parallel, rgbt, sequences, single, stills, vtuav};
 use crate::pseudo::{self, PseudoError, PseudoOptions};
+
+/// One kind of dataset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Kind {
+    /// What stands before the colon.
+    pub name: &'static str,
+    /// What it reads, in a few words.
+    pub about: &'static str,
+    /// What may follow the name behind a slash.
+    pub options: &'static [&'static str],
+}
+
+const fn kind(name: &'static str, about: &'static str, options: &'static [&'static str]) -> Kind {
+    Kind { name, about, options }
+}
+
+/// Every kind [`open`] and [`scan`] know.
+pub const KINDS: [Kind; 13] = [
+    kind("sequences", "LasHeR-like clips of one or two sensors, optional index.json", &[]),
+    kind("pairs", "registered RGB-thermal stills with an index.json", &[]),
+    kind("pseudo", "clips made from such stills, one per target", &[]),
+    kind("stills", "stills with boxes listed in an index.json", &[]),
+    kind("coco", "stills with COCO annotation files", &["thermal"]),
+    kind("lasher", "LasHeR", &[]),
+    kind("rgbt234", "RGBT234", &[]),
+    kind("rgbt210", "RGBT210", &[]),
+    kind("gtot", "GTOT", &[]),
+    kind("vtuav", "VTUAV", &["interpolated"]),
+    kind("antiuav", "Anti-UAV, RGB-T or thermal only (Anti-UAV410)", &["registered"]),
+    kind("otb", "OTB style clips of one sensor", &["thermal", "zero-based"]),
+    kind("got10k", "GOT-10k style clips of one sensor", &["thermal"]),
+];
 
 /// Which part of a dataset.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -83,17 +112,60 @@ impl fmt::Debug for Dataset {
     }
 }
 
+/// What [`scan`] found: what could be read, and what could not.
+pub struct Scan {
+    /// The text it was opened by.
+    pub name: String,
+    /// The sequences that could be read, in a fixed order.
+    pub sequences: Vec<Box<dyn Sequence>>,
+    /// Why others could not, with file and line.
+    pub broken: Vec<DatasetError>,
+}
+
+impl fmt::Debug for Scan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ids: Vec<&str> = self.sequences.iter().map(|s| s.id()).collect();
+        f.debug_struct("Scan")
+            .field("name", &self.name)
+            .field("sequences", &ids)
+            .field("broken", &self.broken)
+            .finish()
+    }
+}
+
+/// `KIND:PATH[@split] ..` for messages.
+fn kinds() -> String {
+    let one = |k: &Kind| match k.options {
+        [] => k.name.to_owned(),
+        options => format!("{}[/{}]", k.name, options.join("|/")),
+    };
+    KINDS.iter().map(one).collect::<Vec<_>>().join(", ")
+}
+
 /// A dataset text that cannot be opened.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OpenError {
     /// The text does not begin with a known kind.
     #[error(
-        "dataset '{text}': expected pairs:PATH[@split], pseudo:PATH[@split] or sequences:PATH[@split]"
+        "dataset '{text}': expected KIND:PATH[@train|@val|@test], KIND being one of {}",
+        kinds()
     )]
     Kind {
         /// The text given.
         text: String,
+    },
+    /// The kind does not know an option.
+    #[error("dataset '{text}': kind {kind} has no option '{option}'{}", known(.options))]
+    Option {
+        /// The text given.
+        text: String,
+        /// The kind.
+        kind: &'static str,
+        /// The option that is none.
+        option: String,
+        /// Options it has.
+        options: &'static [&'static str],
     },
     /// What follows the `@` is no split.
     #[error("dataset '{text}': {source}")]
@@ -117,14 +189,36 @@ pub enum OpenError {
     },
 }
 
-/// Opens `pairs:PATH[@split]`, `pseudo:PATH[@split]` or `sequences:PATH[@split]`; without a split,
-/// everything. Of `pseudo`, all stills used are decoded at once and kept.
-///
-/// # Errors
-/// For a text of another form, an unknown split, or a folder that cannot be read.
-pub fn open(text: &str) -> Result<Dataset, OpenError> {
-    let (kind, rest) =
-        text.split_once(':').ok_or_else(|| OpenError::Kind { text: text.to_owned() })?;
+fn known(options: &[&str]) -> String {
+    match options {
+        [] => "; it has none".into(),
+        options => format!("; it has {}", options.join(", ")),
+    }
+}
+
+/// A dataset text taken apart.
+struct Parsed<'a> {
+    kind: &'static Kind,
+    options: Vec<&'a str>,
+    path: &'a Path,
+    split: Split,
+}
+
+fn parse(text: &str) -> Result<Parsed<'_>, OpenError> {
+    let no_kind = || OpenError::Kind { text: text.to_owned() };
+    let (head, rest) = text.split_once(':').ok_or_else(no_kind)?;
+    let mut words = head.split('/');
+    let name = words.next().unwrap_or_default();
+    let kind = KINDS.iter().find(|k| k.name == name).ok_or_else(no_kind)?;
+    let options: Vec<&str> = words.collect();
+    if let Some(option) = options.iter().find(|o| !kind.options.contains(o)) {
+        return Err(OpenError::Option {
+            text: text.to_owned(),
+            kind: kind.name,
+            option: (*option).to_owned(),
+            options: kind.options,
+        });
+    }
     // An '@' followed by a path separator belongs to the path.
     let (path, split) = match rest.rsplit_once('@') {
         Some((path, split)) if !split.contains(['/', '\\']) => {
@@ -136,11 +230,20 @@ pub fn open(text: &str) -> Result<Dataset, OpenError> {
         _ => (rest, Split::All),
     };
     if path.is_empty() {
-        return Err(OpenError::Kind { text: text.to_owned() });
+        return Err(no_kind());
     }
-    let path = Path::new(path);
-    let sequences: Vec<Box<dyn Sequence>> = match kind {
-        "pairs" => boxed(PairsDataset::open(path, split)?.into_pairs()),
+    Ok(Parsed { kind, options, path: Path::new(path), split })
+}
+
+fn jobs(text: &str) -> Result<Jobs, OpenError> {
+    let Parsed { kind, options, path, split } = parse(text)?;
+    let on = |option: &str| options.contains(&option);
+    let modality = if on("thermal") { Modality::Thermal } else { Modality::Rgb };
+    Ok(match kind.name {
+        "pairs" => {
+            let (pairs, problems) = PairsDataset::scan(path, split)?;
+            Jobs { problems, ..Jobs::ready(pairs.into_pairs()) }
+        }
         "pseudo" => {
             let pairs = PairsDataset::open(path, split)?;
             let stills = pairs.pairs().iter().map(|p| p as &dyn Sequence);
@@ -148,19 +251,53 @@ pub fn open(text: &str) -> Result<Dataset, OpenError> {
             if clips.is_empty() {
                 return Err(OpenError::NoClips { text: text.to_owned() });
             }
-            boxed(clips)
+            Jobs::ready(clips)
         }
-        "sequences" => {
-            let filter = SequenceFilter { split, ..SequenceFilter::default() };
-            boxed(SequencesDataset::open(path, &filter)?.into_sequences())
-        }
+        "sequences" => sequences::jobs(path, split)?,
+        "stills" => stills::stills(path, split)?,
+        "coco" => stills::coco(path, split, modality)?,
+        "lasher" => lasher::jobs(path, split)?,
+        "rgbt234" => rgbt::rgbt234(path, split)?,
+        "rgbt210" => rgbt::rgbt210(path, split)?,
+        "gtot" => rgbt::gtot(path, split)?,
+        "vtuav" => vtuav::jobs(path, split, on("interpolated"))?,
+        "antiuav" => antiuav::jobs(path, split, on("registered"))?,
+        "otb" => single::otb(path, split, modality, on("zero-based"))?,
+        "got10k" => single::got10k(path, split, modality)?,
         _ => return Err(OpenError::Kind { text: text.to_owned() }),
-    };
-    Ok(Dataset { name: text.to_owned(), sequences })
+    })
 }
 
-fn boxed<S: Sequence + 'static>(items: Vec<S>) -> Vec<Box<dyn Sequence>> {
-    items.into_iter().map(|s| Box::new(s) as Box<dyn Sequence>).collect()
+/// Opens `KIND[/option..]:PATH[@split]`, see [`KINDS`]; without a split, everything. Annotations
+/// are read, several at a time, pictures only found. (Of `pseudo`, all stills used are decoded at
+/// once and kept.)
+///
+/// # Errors
+/// For a text of another form, an unknown kind, option or split, a folder that cannot be read, and
+/// the first thing in it that is broken: figures on part of a benchmark would mean little.
+/// [`scan`] finds everything that is.
+pub fn open(text: &str) -> Result<Dataset, OpenError> {
+    let Scan { name, sequences, broken } = scan(text)?;
+    match broken.into_iter().next() {
+        Some(first) => Err(first.into()),
+        None => Ok(Dataset { name, sequences }),
+    }
+}
+
+/// As [`open`], but goes on past sequences that cannot be read.
+///
+/// # Errors
+/// When the text is wrong or there is nothing to look at.
+pub fn scan(text: &str) -> Result<Scan, OpenError> {
+    let Jobs { jobs, problems: mut broken } = jobs(text)?;
+    let mut sequences = Vec::with_capacity(jobs.len());
+    for outcome in parallel::map(jobs, parallel::threads(), |job| job()) {
+        match outcome {
+            Ok(sequence) => sequences.push(sequence),
+            Err(e) => broken.push(e),
+        }
+    }
+    Ok(Scan { name: text.to_owned(), sequences, broken })
 }
 
 #[cfg(test)]
@@ -170,9 +307,12 @@ mod tests {
     #[test]
     fn bad_texts_say_what_was_expected() {
         for (text, want) in [
-            ("here", "pairs:PATH"),
-            ("video:here", "pairs:PATH"),
-            ("pairs:", "pairs:PATH"),
+            ("here", "KIND:PATH"),
+            ("video:here", "sequences, pairs, pseudo, stills, coco[/thermal], lasher"),
+            ("pairs:", "KIND:PATH"),
+            ("antiuav/warped:here", "has no option 'warped'; it has registered"),
+            ("gtot/thermal:here", "'thermal'; it has none"),
+            ("gtot:here@train", "here"),
             ("pairs:here@vall", "unknown split 'vall'"),
             ("sequences:not/there", "not/there"),
         ] {

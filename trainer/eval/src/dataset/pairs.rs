@@ -86,6 +86,10 @@ impl Sequence for Pair {
         if frame == 0 { self.boxes.get(target).map(|b| b.bbox) } else { None }
     }
 
+    fn picture_path(&self, frame: usize, modality: Modality) -> Option<PathBuf> {
+        (frame == 0).then(|| self.path(modality).to_owned())
+    }
+
     fn picture(&self, frame: usize, modality: Modality) -> Result<Picture, DatasetError> {
         if frame != 0 {
             return Err(DatasetError::NoSuchFrame { sequence: self.id.clone(), frame, modality });
@@ -123,7 +127,18 @@ impl PairsDataset {
     /// not a box or lies outside its picture, an id stands twice, a picture file is missing, or
     /// no pair is in `split`. Each names the index and the pair.
     pub fn open(dir: impl AsRef<Path>, split: Split) -> Result<Self, DatasetError> {
-        let dir = dir.as_ref();
+        let (set, problems) = Self::scan(dir.as_ref(), split)?;
+        match problems.into_iter().next() {
+            Some(first) => Err(first),
+            None => Ok(set),
+        }
+    }
+
+    /// As [`Self::open`], but passes over pairs that cannot be used and says what is wrong.
+    pub(crate) fn scan(
+        dir: &Path,
+        split: Split,
+    ) -> Result<(Self, Vec<DatasetError>), DatasetError> {
         let path = dir.join(INDEX);
         let text = std::fs::read_to_string(&path)
             .map_err(|source| DatasetError::Io { path: path.clone(), source })?;
@@ -140,37 +155,42 @@ impl PairsDataset {
             .ok_or_else(|| format("field 'pairs' is missing or not a list".into()))?;
         let mut pairs = Vec::with_capacity(entries.len());
         let mut seen = HashSet::new();
+        let mut problems = Vec::new();
         for (i, entry) in entries.iter().enumerate() {
-            let pair = read_pair(dir, entry).map_err(|reason| {
-                let who = match entry.get("id").and_then(Value::as_str) {
-                    Some(id) => format!("pair '{id}'"),
-                    None => format!("pair number {i} (0-based)"),
-                };
-                format(format!("{who}: {reason}"))
-            })?;
+            let pair = match read_pair(dir, entry) {
+                Ok(pair) => pair,
+                Err(reason) => {
+                    let who = match entry.get("id").and_then(Value::as_str) {
+                        Some(id) => format!("pair '{id}'"),
+                        None => format!("pair number {i} (0-based)"),
+                    };
+                    problems.push(format(format!("{who}: {reason}")));
+                    continue;
+                }
+            };
             if !seen.insert(pair.id.clone()) {
-                return Err(format(format!("pair '{}' stands twice: ids must differ", pair.id)));
+                problems.push(format(format!("pair '{}' stands twice: ids must differ", pair.id)));
+                continue;
             }
             if split.takes(&pair.split) {
-                for file in [&pair.visible, &pair.infrared] {
-                    if !file.is_file() {
-                        return Err(format(format!(
-                            "pair '{}': picture {} does not exist",
-                            pair.id,
-                            file.display()
-                        )));
-                    }
+                let missing = [&pair.visible, &pair.infrared].into_iter().find(|f| !f.is_file());
+                let problem = missing.map(|file| {
+                    let file = file.display();
+                    format(format!("pair '{}': picture {file} does not exist", pair.id))
+                });
+                match problem {
+                    Some(problem) => problems.push(problem),
+                    None => pairs.push(pair),
                 }
-                pairs.push(pair);
             }
         }
-        if pairs.is_empty() {
+        if pairs.is_empty() && problems.is_empty() {
             return Err(format(format!(
                 "none of the {} pairs is in split '{split}'",
                 entries.len()
             )));
         }
-        Ok(Self { pairs })
+        Ok((Self { pairs }, problems))
     }
 
     /// The pairs.

@@ -1,14 +1,7 @@
 use super::*;
-use crate::dataset::{DatasetError, open};
-
-fn pictures(dir: &Path, names: &[&str]) {
-    std::fs::create_dir_all(dir).unwrap();
-    for (i, name) in names.iter().enumerate() {
-        image::GrayImage::from_pixel(6, 4, image::Luma([10 * i as u8]))
-            .save(dir.join(name))
-            .unwrap();
-    }
-}
+use crate::dataset::open;
+use crate::dataset::testing::pictures;
+use tsda_runtime::{BBox, Modality};
 
 /// Two tiers, LasHeR letters in the names, unequal counts, every separator quirk.
 fn write(root: &Path) {
@@ -41,7 +34,7 @@ fn reads_every_folder_with_its_quirks() {
     assert_eq!(a.truth(0, 2, Modality::Rgb), None);
     assert_eq!(a.truth(0, 0, Modality::Thermal), Some(BBox::new(1.0, 2.0, 3.0, 4.5)));
     assert_eq!(a.truth(0, 2, Modality::Thermal), Some(BBox::new(1.0, 1.0, 1.0, 1.0)));
-    assert!(a.notes()[0].contains("3 and 4 pictures"), "{:?}", a.notes());
+    assert!(a.notes()[0].text.contains("3 and 4 pictures"), "{:?}", a.notes());
     assert!(a.path(2, Modality::Thermal).unwrap().ends_with("i10.png"));
     assert_eq!(a.picture(1, Modality::Thermal).unwrap().data, [10; 24]);
     assert_eq!(a.picture(1, Modality::Rgb).unwrap().channels, 3);
@@ -51,7 +44,7 @@ fn reads_every_folder_with_its_quirks() {
     let b = &set.sequences()[1];
     assert_eq!(b.modalities(), [Modality::Thermal]);
     assert_eq!(b.truth(0, 0, Modality::Thermal), Some(BBox::new(0.0, 0.0, 2.0, 2.0)));
-    assert!(b.notes()[0].contains("no infrared.txt"));
+    assert!(b.notes()[0].text.contains("no infrared.txt"));
     assert!(matches!(b.picture(0, Modality::Rgb), Err(DatasetError::NoSuchFrame { .. })));
 
     // Fewer boxes than pictures: the rest is not annotated.
