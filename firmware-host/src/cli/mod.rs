@@ -1,6 +1,8 @@
 //! The command line: what was typed ([`Cli`]) and what it does ([`execute`]).
 
 #[cfg(feature = "eval")]
+mod compare;
+#[cfg(feature = "eval")]
 mod data_check;
 mod demo;
 #[cfg(feature = "camera")]
@@ -10,12 +12,18 @@ mod eval;
 mod info;
 mod render;
 mod replay;
+#[cfg(feature = "eval")]
+mod score;
 mod track;
 mod trax;
 mod verify;
 
+#[cfg(feature = "eval")]
+pub use compare::CompareArgs;
 pub use render::RenderArgs;
 pub use replay::ReplayArgs;
+#[cfg(feature = "eval")]
+pub use score::{LayoutArg, LengthsArg, ScoreArgs};
 pub use trax::TraxArgs;
 
 use crate::engine::EngineArgs;
@@ -65,6 +73,12 @@ pub enum Command {
     /// Look through a dataset: counts, absences, resolutions, attributes, broken files
     #[cfg(feature = "eval")]
     DataCheck(data_check::DataCheckArgs),
+    /// Score one result file against its truth, by a benchmark's own rules
+    #[cfg(feature = "eval")]
+    Score(ScoreArgs),
+    /// Compare folders of results, of this or any other tracker
+    #[cfg(feature = "eval")]
+    Compare(CompareArgs),
     /// List V4L2 cameras and their formats
     #[cfg(feature = "camera")]
     Devices,
@@ -210,6 +224,10 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Render(args) => render::run(args),
         #[cfg(feature = "eval")]
         Command::DataCheck(args) => data_check::run(args),
+        #[cfg(feature = "eval")]
+        Command::Score(args) => score::run(args),
+        #[cfg(feature = "eval")]
+        Command::Compare(args) => compare::run(args),
         #[cfg(feature = "camera")]
         Command::Devices => devices::run(),
     }

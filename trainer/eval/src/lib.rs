@@ -7,7 +7,10 @@
 //!   [`protocol::TrackerUnderTest`], what can be evaluated.
 //! * [`evaluate()`]: a whole dataset, several sequences at a time; the same figures on any number of
 //!   threads.
-//! * [`metrics`]: SR@0.5, success AUC, PR@20, normalised precision, mean IoU.
+//! * [`metrics`]: SR@0.5, success AUC, PR@20, normalised precision, mean IoU; the same by the rules of
+//!   each benchmark's toolkit; time to recover after a sensor switch.
+//! * [`truth`], [`results`], [`attributes`], [`compare`]: results of any tracker, read from text,
+//!   scored against any truth and put side by side in a [`report_data::ReportData`].
 //! * [`baselines`]: a static box and template matching, what a tracker has to beat.
 //! * [`summary`], [`otb`]: JSON, Markdown and OTB text.
 //!
@@ -38,16 +41,23 @@
 //! ```
 //! A bundle's tracker goes the same way, wrapped in a [`RuntimeTracker`].
 
+pub mod attributes;
 pub mod baselines;
+pub mod boxes;
+pub mod compare;
 pub mod dataset;
 pub mod evaluate;
 pub mod metrics;
 pub mod otb;
 pub mod protocol;
 pub mod pseudo;
+pub mod report_data;
+pub mod results;
 mod rng;
 pub mod runtime;
 pub mod summary;
+pub mod tables;
+pub mod truth;
 
 pub use evaluate::{Evaluation, Options, Progress, evaluate};
 pub use runtime::RuntimeTracker;

@@ -1,68 +1,32 @@
-//! Results as OTB text: one `x,y,w,h` per line and frame, pixels, top-left origin.
+//! Results as OTB text: one `x,y,w,h` per line and frame, pixels, top-left origin. The layouts of
+//! whole result folders are in [`crate::results`].
 
-use std::fmt::Write as _;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use tsda_runtime::BBox;
 
+use crate::boxes::{self, Layout, Style};
 use crate::dataset::DatasetError;
+use crate::metrics::score::{bbox, row};
 
 /// Writes boxes with three decimals, the first line being the initial box.
 ///
 /// # Errors
 /// When the file cannot be written; then nothing is left behind and an older file stays.
 pub fn write(path: &Path, boxes: &[BBox]) -> Result<(), DatasetError> {
-    let mut text = String::with_capacity(boxes.len() * 32);
-    for b in boxes {
-        // Writing into a String cannot fail.
-        let _ = writeln!(text, "{:.3},{:.3},{:.3},{:.3}", b.x, b.y, b.w, b.h);
-    }
-    write_whole(path, text.as_bytes())
+    let rows: Vec<_> = boxes.iter().map(|b| row(Some(*b))).collect();
+    write_whole(path, boxes::format(&rows, Style::Comma).as_bytes())
         .map_err(|source| DatasetError::Io { path: path.to_owned(), source })
 }
 
-/// Reads boxes as they stand, with or without area. Commas, tabs, semicolons and spaces separate,
-/// CRLF and blank lines at the end are fine, NaN is kept.
+/// Reads boxes as they stand, with or without area; [`boxes`] says which texts are understood.
 ///
 /// # Errors
 /// When the file cannot be read, holds no line, or a line does not hold four numbers; the error
 /// names file and line.
 pub fn read_rows(path: &Path) -> Result<Vec<BBox>, DatasetError> {
-    // Lossy: a stray byte makes one bad number with its line, not an unreadable file.
-    let bytes =
-        std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_owned(), source })?;
-    let text = String::from_utf8_lossy(&bytes);
-    let text = text.strip_prefix('\u{feff}').unwrap_or(&text).trim_end();
-    let format =
-        |line, reason: String| DatasetError::Format { path: path.to_owned(), line, reason };
-    if text.is_empty() {
-        return Err(format(None, "no boxes in it: expected x,y,w,h per line".into()));
-    }
-    text.lines()
-        .enumerate()
-        .map(|(i, line)| parse_row(line).map_err(|reason| format(Some(i + 1), reason)))
-        .collect()
-}
-
-fn parse_row(line: &str) -> Result<BBox, String> {
-    let mut numbers = [0f32; 4];
-    let mut n = 0;
-    for field in line.split([',', '\t', ' ', ';', '\r']).filter(|f| !f.is_empty()) {
-        let value: f32 = field.parse().map_err(|_| format!("'{field}' is not a number"))?;
-        if value.is_infinite() {
-            return Err(format!("'{field}' is not finite"));
-        }
-        if let Some(slot) = numbers.get_mut(n) {
-            *slot = value;
-        }
-        n += 1;
-    }
-    if n != 4 {
-        return Err(format!("expected four numbers x,y,w,h, found {n} in '{}'", line.trim()));
-    }
-    let [x, y, w, h] = numbers;
-    Ok(BBox::new(x, y, w, h))
+    Ok(boxes::read(path, Layout::Xywh)?.into_iter().map(bbox).collect())
 }
 
 /// Writes a whole file or nothing: a temporary neighbour, then a rename.

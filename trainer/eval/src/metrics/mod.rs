@@ -15,6 +15,19 @@
 //! says nothing about it; [`FirstFrame`] says how it enters.
 //!
 //! A prediction without area has IoU 0; one that is not finite misses by an infinite distance.
+//!
+//! Figures that equal a benchmark's own toolkit, with its rounding, its thresholds and its peculiar
+//! treatment of absent targets, come from [`convention`] and [`score()`]; time to recover after a
+//! sensor switch from [`recovery`]; the VOT overlap from [`overlap`].
+
+pub mod convention;
+pub mod overlap;
+pub mod recovery;
+pub mod score;
+
+pub use convention::{Averaging, Convention};
+pub use recovery::{Recovery, SwitchRecovery};
+pub use score::{Curves, Figures, Lengths, Row, Score, ScoreError, ScoreOptions, Truth, score};
 
 use serde::{Deserialize, Serialize};
 use tsda_runtime::BBox;
@@ -205,5 +218,4 @@ pub fn measure(
 }
 
 #[cfg(test)]
-#[path = "metrics_tests.rs"]
 mod tests;
