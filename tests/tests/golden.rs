@@ -129,7 +129,7 @@ impl Copy {
         let path = self.0.path().join(file);
         let mut dict = StateDict::read(&path).unwrap();
         change(&mut dict);
-        dict.write(&path).unwrap();
+        dict.write(&path, &Default::default()).unwrap();
     }
 
     fn run(&self) -> Result<Report, GoldenError> {
@@ -169,18 +169,18 @@ fn a_weight_that_is_off_fails() {
     let net = TrackerNet::new(&ModelSpec::SMALL, &NetOptions::default(), &burn_device());
     let mut dict = state_dict(&golden::recipe::fill(net.unwrap()).unwrap());
     let path = copy.0.path().join("weights.safetensors");
-    dict.write(&path).unwrap();
+    dict.write(&path, &Default::default()).unwrap();
     assert!(copy.run().unwrap().passed(false), "the recipe's own weights");
     let name = "head.filter_predictor.transformer.encoder.layers.1.linear1.bias";
     shifted(&mut dict, name, 0.05);
-    dict.write(&path).unwrap();
+    dict.write(&path, &Default::default()).unwrap();
     let report = copy.run().unwrap();
     let off: Vec<&str> = report.failures().map(|l| l.tensor.as_str()).collect();
     assert!(off.contains(&"scores") && off.contains(&"cls_filter"), "{off:?}");
     assert!(!off.contains(&"test_feat.ch_step16"), "{off:?}");
     // Weights of another network are refused by name.
     dict.retain(|n| n != name);
-    dict.write(&path).unwrap();
+    dict.write(&path, &Default::default()).unwrap();
     let error = copy.run().unwrap_err().to_string();
     assert!(error.contains(name) && error.contains("1 missing"), "{error}");
 }
