@@ -101,13 +101,15 @@ impl TrackerNet {
     /// # Panics
     /// When `templates` is empty.
     pub fn predict_parts(&self, templates: Vec<Tensor<2>>, search: Tensor<4>) -> Parts {
-        assert!(!templates.is_empty(), "predict needs the tokens of at least one template");
+        assert!(!templates.is_empty(), "predict needs the slot of at least one template");
         let side = search.dims()[2];
-        let search = self.head.search_tokens(search);
-        let cls = self.head.predict_filter(sequence(&templates, &search), side);
-        let reg = match templates.as_slice() {
-            [_] => cls.clone(),
-            several => self.head.predict_filter(sequence(&several[..1], &search), side),
+        let frames = self.prepared(templates, search);
+        let run = |frames| self.head.predict_filter_prepared(Tensor::cat(frames, 1), side);
+        let cls = run(frames.clone());
+        let reg = match frames.as_slice() {
+            [_, _] => cls.clone(),
+            [annotated, .., search] => run(vec![annotated.clone(), search.clone()]),
+            _ => unreachable!("a template and the search frame"),
         };
         self.parts(cls, reg, side)
     }
@@ -117,10 +119,10 @@ impl TrackerNet {
     /// # Panics
     /// When `templates` is empty.
     pub fn single_parts(&self, templates: Vec<Tensor<2>>, search: Tensor<4>) -> Parts {
-        assert!(!templates.is_empty(), "a pass needs the tokens of at least one template");
+        assert!(!templates.is_empty(), "a pass needs the slot of at least one template");
         let side = search.dims()[2];
-        let search = self.head.search_tokens(search);
-        let both = self.head.predict_filter(sequence(&templates, &search), side);
+        let frames = self.prepared(templates, search);
+        let both = self.head.predict_filter_prepared(Tensor::cat(frames, 1), side);
         self.parts(both.clone(), both, side)
     }
 
@@ -141,12 +143,6 @@ impl TrackerNet {
             reg_filter: reg.0,
         }
     }
-}
-
-/// Tokens of all frames, `(1, frames * F*F, d)`, the search frame last.
-fn sequence(templates: &[Tensor<2>], search: &Tensor<3>) -> Tensor<3> {
-    let frames = templates.iter().map(|t| t.clone().unsqueeze_dim::<3>(0));
-    Tensor::cat(frames.chain([search.clone()]).collect(), 1)
 }
 
 #[cfg(test)]

@@ -189,27 +189,22 @@ impl TrackerNet {
     /// # Panics
     /// When `templates` is empty; [`crate::burn_engine::BurnEngine`] checks.
     pub fn predict(&self, templates: Vec<Tensor<2>>, search: Tensor<4>) -> (Tensor<2>, Tensor<3>) {
-        assert!(!templates.is_empty(), "predict needs the slot of at least one template");
+        let parts = self.predict_parts(templates, search);
+        (parts.scores, parts.ltrb)
+    }
+
+    /// Filled slots in any [`SlotForm`] and a search feature `(1, d, F, F)` as frames
+    /// `(1, F*F, 4d)`, the search frame last: tokens with their projections in the first encoder
+    /// layer.
+    fn prepared(&self, templates: Vec<Tensor<2>>, search: Tensor<4>) -> Vec<Tensor<3>> {
         let [_, d, side, _] = search.dims();
-        let search = self.head.prepare(self.head.search_tokens(search), side);
-        let frames: Vec<Tensor<3>> = templates
-            .into_iter()
-            .map(|slot| {
-                let width = slot.dims()[1];
-                let slot = slot.unsqueeze_dim::<3>(0);
-                if width == d { self.head.prepare(slot, side) } else { slot }
-            })
-            .collect();
-        let run = |frames: &[Tensor<3>]| {
-            let sequence = frames.iter().chain([&search]).cloned().collect();
-            self.head.predict_filter_prepared(Tensor::cat(sequence, 1), side)
+        let prepare = |slot: Tensor<2>| {
+            let width = slot.dims()[1];
+            let slot = slot.unsqueeze_dim::<3>(0);
+            if width == d { self.head.prepare(slot, side) } else { slot }
         };
-        let (filter, encoded) = run(&frames);
-        let scores = self.head.scores(filter.clone(), encoded.clone(), side);
-        let (filter, encoded) =
-            if frames.len() == 1 { (filter, encoded) } else { run(&frames[..1]) };
-        let ltrb = self.head.ltrb(filter, encoded, side);
-        (scores.reshape([side, side]), ltrb.reshape([4, side, side]))
+        let search = self.head.prepare(self.head.search_tokens(search), side);
+        templates.into_iter().map(prepare).chain([search]).collect()
     }
 
     /// The single pass of spec 1.7 over `B` sequences of `T` templates and one search frame.
