@@ -190,7 +190,7 @@ fn trackers_side_by_side() {
     assert_eq!((&v["version"], &v["convention"]), (&Value::from(1), &Value::from("tsda")));
     let protocol = &v["protocols"][0];
     assert_eq!(protocol["protocol"], "switch:1");
-    assert_eq!(protocol["trackers"][0]["recovery"]["switches"], 3);
+    assert_eq!(protocol["trackers"][0]["recovery"]["switches"], 6);
     assert_eq!(protocol["best"]["sr50"][0], "ours");
 
     fs::remove_file(at.join("b/B_s1.txt")).expect("remove");
