@@ -93,6 +93,8 @@ impl ResultFolder {
 
     /// The files with results of a sequence, in the order of repetitions; empty when there is none.
     pub fn files(&self, prefix: &str, sequence: &str) -> Vec<PathBuf> {
+        let sequence = self.known_name(prefix, sequence);
+        let sequence = sequence.as_str();
         let flat = format!("{prefix}{sequence}");
         if self.stems.contains(&flat) {
             return vec![self.path.join(format!("{flat}.txt"))];
@@ -115,6 +117,17 @@ impl ResultFolder {
         files
     }
 
+    /// The name a sequence has here: its own, or with `_` for characters that file names should not
+    /// have, as `tsda eval` writes it (LasHeR has apostrophes and back-quotes).
+    fn known_name(&self, prefix: &str, sequence: &str) -> String {
+        let plain =
+            sequence.replace(|c: char| !(c.is_ascii_alphanumeric() || "-_.#".contains(c)), "_");
+        let known = |name: &str| {
+            self.stems.contains(&format!("{prefix}{name}")) || self.nested.contains_key(name)
+        };
+        if !known(sequence) && known(&plain) { plain } else { sequence.to_owned() }
+    }
+
     /// Sensors of the frames, where the folder says them.
     ///
     /// # Errors
@@ -124,12 +137,13 @@ impl ResultFolder {
         prefix: &str,
         sequence: &str,
     ) -> Result<Option<Vec<Modality>>, DatasetError> {
+        let sequence = self.known_name(prefix, sequence);
         let flat = format!("{prefix}{sequence}{MODALITY_SUFFIX}");
         let nested = format!("{sequence}{MODALITY_SUFFIX}");
         let path = if self.stems.contains(&flat) {
             self.path.join(format!("{flat}.txt"))
-        } else if self.nested.get(sequence).is_some_and(|s| s.contains(&nested)) {
-            self.path.join(sequence).join(format!("{nested}.txt"))
+        } else if self.nested.get(&sequence).is_some_and(|s| s.contains(&nested)) {
+            self.path.join(&sequence).join(format!("{nested}.txt"))
         } else {
             return Ok(None);
         };
@@ -245,6 +259,9 @@ mod tests {
             write_got10k(&at("got"), s, 2, &B, None).unwrap();
         }
         let all = ["man", "bigman"];
+        write_otb(&at("flat"), "leftgirl_swhitebag", &B, None).unwrap();
+        let flat = ResultFolder::open(&at("flat"), None).unwrap();
+        assert_eq!(flat.files("", "leftgirl'swhitebag"), [at("flat/leftgirl_swhitebag.txt")]);
         for (name, prefix, files) in [
             ("flat", "", vec!["man.txt"]),
             ("prefixed", "My_", vec!["My_man.txt"]),
