@@ -127,7 +127,7 @@ fn main() -> ExitCode {
     match run(Args::parse().command) {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("tsda-export: {}", tsda_runtime::one_line(error.as_ref()));
             ExitCode::from(2)
         }
     }

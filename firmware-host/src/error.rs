@@ -1,5 +1,7 @@
 //! What can go wrong in the program, and the exit code each kind gets.
 
+pub use tsda_runtime::one_line;
+
 use crate::frames::SourceError;
 use std::path::PathBuf;
 use tsda_runtime::bundle::BundleFileError;
@@ -146,19 +148,4 @@ impl HostError {
             | Self::Interrupted => EXIT_RUNTIME,
         }
     }
-}
-
-/// The error and its causes on one line. A cause that a message already quotes is not repeated.
-pub fn one_line(error: &dyn std::error::Error) -> String {
-    let mut line = error.to_string();
-    let mut cause = error.source();
-    while let Some(e) = cause {
-        let text = e.to_string();
-        if !line.contains(&text) {
-            line.push_str(": ");
-            line.push_str(&text);
-        }
-        cause = e.source();
-    }
-    line.replace(['\n', '\r'], " ")
 }

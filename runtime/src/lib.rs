@@ -21,6 +21,8 @@ pub mod geometry;
 pub mod labels;
 pub mod localise;
 pub mod memory;
+#[cfg(feature = "std")]
+mod one_line;
 pub mod probe;
 pub mod spec;
 #[cfg(test)]
@@ -32,5 +34,7 @@ pub use frame::{FrameError, FrameView, PixelFormat};
 pub use geometry::{BBox, Modality, Yx};
 pub use localise::Flag;
 pub use memory::TemplateMemory;
+#[cfg(feature = "std")]
+pub use one_line::one_line;
 pub use spec::{Backbone, ModelSpec, SpecError, TrackerParams};
 pub use tracker::{BoxError, Track, TrackError, TrackState, Tracker};

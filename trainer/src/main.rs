@@ -117,7 +117,7 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("tsda-train: {e:#}");
+            eprintln!("tsda-train: {}", tsda_runtime::one_line(e.as_ref()));
             ExitCode::from(2)
         }
     }
