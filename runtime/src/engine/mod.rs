@@ -9,15 +9,19 @@
 //!    [`Engine::write_template`]: the head feature of the last `features` call becomes the tokens of
 //!    that slot.
 
-#[cfg(any(feature = "tract", feature = "ort"))]
+#[cfg(any(feature = "native", feature = "tract", feature = "ort"))]
 pub mod any;
+#[cfg(feature = "native")]
+pub mod native;
 #[cfg(feature = "ort")]
 pub mod ort;
 #[cfg(feature = "tract")]
 pub mod tract;
 
-#[cfg(any(feature = "tract", feature = "ort"))]
+#[cfg(any(feature = "native", feature = "tract", feature = "ort"))]
 pub use any::{AnyEngine, EngineChoice};
+#[cfg(feature = "native")]
+pub use native::{NativeEngine, NativeOptions};
 #[cfg(feature = "tract")]
 pub use tract::TractEngine;
 
@@ -61,7 +65,7 @@ pub trait Engine {
 
 /// Shape of a template slot, as the `template` graph declares its output `tokens`: one row per cell
 /// and one or several blocks of the network's width. What the blocks are is the graphs' own affair.
-#[cfg(any(feature = "tract", feature = "ort"))]
+#[cfg(any(feature = "native", feature = "tract", feature = "ort"))]
 fn slot_shape(
     engine: &'static str,
     spec: &ModelSpec,

@@ -1,0 +1,313 @@
+//! Products with constant matrices: convolutions as implicit GEMM and linear layers. Rows are
+//! pixels or tokens wherever they lie; weights are packed into panels, in the order they are read.
+
+use super::simd::Simd;
+use super::table::{Kernels, MAX_ROWS};
+use super::{Halo, Mem, Part, Pitch, Place};
+
+/// Panels of packed weights smaller than this stay in the second-level cache, so tiles of rows can
+/// be the outer loop.
+const RESIDENT: usize = 96 * 1024;
+
+/// `out = clamp(in * weights + bias + residual)`.
+#[derive(Clone, Debug)]
+pub struct Gemm {
+    /// Rows: lines and pixels per line.
+    pub size: [usize; 2],
+    /// First element of the first row's window.
+    pub input: Place,
+    /// From row to row of the input.
+    pub input_pitch: Pitch,
+    /// Offsets of the runs of `run` channels that a window consists of.
+    pub taps: Box<[usize]>,
+    /// Elements per tap.
+    pub run: usize,
+    /// Packed weights: [`Packing`] of `taps * run` rows.
+    pub weights: usize,
+    /// Bias, padded with zeros to the packed width.
+    pub bias: Option<usize>,
+    /// Columns of the result.
+    pub columns: usize,
+    /// First element of the result, in the arena.
+    pub output: usize,
+    /// From row to row of the result.
+    pub output_pitch: Pitch,
+    /// Added before the limits; same size as the result.
+    pub residual: Option<(Place, Pitch)>,
+    /// Range of the result.
+    pub clamp: (f32, f32),
+    /// Zeros around the result.
+    pub halo: Option<Halo>,
+    /// Rows whose inputs fit into the second-level cache together with a panel.
+    pub block: usize,
+}
+
+/// How weights are laid out: panels of `width` columns, the last one of as many whole vectors as it
+/// needs; in a panel all rows one after the other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Packing {
+    /// Columns of a panel.
+    pub width: usize,
+    /// Floats of a vector.
+    pub lanes: usize,
+}
+
+impl Packing {
+    /// Columns with padding.
+    pub const fn columns(&self, columns: usize) -> usize {
+        columns.next_multiple_of(self.lanes)
+    }
+
+    /// Floats of a packed matrix.
+    pub const fn len(&self, rows: usize, columns: usize) -> usize {
+        rows * self.columns(columns)
+    }
+
+    /// Appends a matrix, given by `row(k, out)`, which fills row `k`.
+    pub fn pack(
+        &self,
+        rows: usize,
+        columns: usize,
+        mut row: impl FnMut(usize, &mut [f32]),
+        out: &mut Vec<f32>,
+    ) {
+        let start = out.len();
+        out.resize(start + self.len(rows, columns), 0.0);
+        let out = &mut out[start..];
+        let mut line = vec![0.0; columns];
+        for k in 0..rows {
+            row(k, &mut line);
+            for (panel, part) in line.chunks(self.width).enumerate() {
+                let width = part.len().next_multiple_of(self.lanes);
+                let at = panel * self.width * rows + k * width;
+                out[at..at + part.len()].copy_from_slice(part);
+            }
+        }
+    }
+}
+
+/// Operands of one tile; rows that are not used repeat nothing and are never read.
+pub struct Tile {
+    /// Rows of the input.
+    pub a: [*const f32; MAX_ROWS],
+    /// Rows of the result.
+    pub c: [*mut f32; MAX_ROWS],
+    /// Rows of the residual, if there is one.
+    pub r: [*const f32; MAX_ROWS],
+    /// Offsets of the taps.
+    pub taps: *const usize,
+    /// Number of taps.
+    pub tap_count: usize,
+    /// Elements per tap.
+    pub run: usize,
+    /// Panel of packed weights.
+    pub b: *const f32,
+    /// Bias of the panel's columns, or null.
+    pub bias: *const f32,
+    /// Column of the panel's first one.
+    pub column: usize,
+    /// Columns to store.
+    pub columns: usize,
+    /// Whether `r` is read.
+    pub residual: bool,
+    /// Factors of the rows, or null.
+    pub factors: *const f32,
+    /// Range of the result.
+    pub clamp: (f32, f32),
+}
+
+impl Tile {
+    pub const EMPTY: Self = Self {
+        a: [core::ptr::null(); MAX_ROWS],
+        c: [core::ptr::null_mut(); MAX_ROWS],
+        r: [core::ptr::null(); MAX_ROWS],
+        taps: core::ptr::null(),
+        tap_count: 0,
+        run: 0,
+        b: core::ptr::null(),
+        bias: core::ptr::null(),
+        column: 0,
+        columns: 0,
+        residual: false,
+        factors: core::ptr::null(),
+        clamp: (f32::NEG_INFINITY, f32::INFINITY),
+    };
+}
+
+/// `R` rows times `NV` vectors of columns, kept in registers over all of the sum.
+///
+/// # Safety
+/// The instruction set is there; all pointers of the tile are valid for its sizes; `columns` is
+/// above `(NV - 1)` vectors and at most `NV`.
+#[inline(always)]
+pub unsafe fn tile<S: Simd, const R: usize, const NV: usize>(t: &Tile) {
+    // SAFETY: as promised by the caller.
+    unsafe {
+        let mut acc = [[S::splat(0.0); NV]; R];
+        let mut b = t.b;
+        for tap in 0..t.tap_count {
+            let offset = *t.taps.add(tap);
+            let mut a = [core::ptr::null::<f32>(); R];
+            for r in 0..R {
+                a[r] = t.a[r].add(offset);
+            }
+            for k in 0..t.run {
+                let mut weights = [S::splat(0.0); NV];
+                for j in 0..NV {
+                    weights[j] = S::load(b.add(j * S::LANES));
+                }
+                b = b.add(NV * S::LANES);
+                for r in 0..R {
+                    let x = S::splat(*a[r].add(k));
+                    for j in 0..NV {
+                        acc[r][j] = S::fma(x, weights[j], acc[r][j]);
+                    }
+                }
+            }
+        }
+        let (low, high) = (S::splat(t.clamp.0), S::splat(t.clamp.1));
+        for j in 0..NV {
+            let at = t.column + j * S::LANES;
+            let n = (t.columns - j * S::LANES).min(S::LANES);
+            let bias = if t.bias.is_null() { S::splat(0.0) } else { S::load(t.bias.add(at)) };
+            for r in 0..R {
+                let mut y = acc[r][j];
+                if !t.factors.is_null() {
+                    y = S::mul(y, S::splat(*t.factors.add(r)));
+                }
+                y = S::add(y, bias);
+                if t.residual {
+                    y = S::add(y, load_some::<S>(t.r[r].add(at), n));
+                }
+                y = S::at_most(high, S::at_least(low, y));
+                if n == S::LANES {
+                    S::store(t.c[r].add(at), y);
+                } else {
+                    S::store_n(t.c[r].add(at), y, n);
+                }
+            }
+        }
+    }
+}
+
+#[inline(always)]
+unsafe fn load_some<S: Simd>(p: *const f32, n: usize) -> S::V {
+    // SAFETY: the caller promises `n` floats and the instruction set.
+    unsafe { if n == S::LANES { S::load(p) } else { S::load_n(p, n) } }
+}
+
+/// Rows and panels that one thread computes.
+struct Share {
+    tiles: core::ops::Range<usize>,
+    panels: core::ops::Range<usize>,
+}
+
+impl Gemm {
+    /// Rows of the product.
+    pub const fn rows(&self) -> usize {
+        self.size[0] * self.size[1]
+    }
+
+    /// Length of the sum.
+    pub const fn depth(&self) -> usize {
+        self.taps.len() * self.run
+    }
+
+    /// Splits rows or columns, whichever comes out more evenly; of two even splits the one that
+    /// reads less.
+    fn share(&self, k: &Kernels, part: Part) -> Share {
+        let tiles = self.rows().div_ceil(k.rows);
+        let panels = self.columns.div_ceil(k.packing.width);
+        let busy = |n: usize| n as f32 / (n.div_ceil(part.of) * part.of) as f32;
+        let (by_rows, by_columns) = (busy(tiles), busy(panels));
+        let weights_larger = self.columns * self.depth() > self.rows() * self.run;
+        if by_rows > by_columns + 0.02 || (by_rows >= by_columns - 0.02 && !weights_larger) {
+            Share { tiles: part.of(tiles), panels: 0..panels }
+        } else {
+            Share { tiles: 0..tiles, panels: part.of(panels) }
+        }
+    }
+
+    /// Computes this thread's part.
+    ///
+    /// # Safety
+    /// The step was checked against this memory, and nobody writes what it reads or touches what it
+    /// writes.
+    pub(super) unsafe fn run(&self, k: &Kernels, mem: Mem, part: Part) {
+        // SAFETY: the step was checked.
+        unsafe {
+            if let Some(halo) = self.halo.as_ref().filter(|_| part.id == 0) {
+                halo.clear(mem);
+            }
+            let share = self.share(k, part);
+            let mut tile = Tile {
+                taps: self.taps.as_ptr(),
+                tap_count: self.taps.len(),
+                run: self.run,
+                bias: self.bias.map_or(core::ptr::null(), |at| mem.weights.add(at)),
+                residual: self.residual.is_some(),
+                clamp: self.clamp,
+                ..Tile::EMPTY
+            };
+            let weights = share.panels.len() * k.packing.width * self.depth();
+            if weights <= RESIDENT {
+                for i in share.tiles {
+                    let rows = self.point(&mut tile, k, mem, i);
+                    for panel in share.panels.clone() {
+                        self.panel(&mut tile, k, mem, panel, rows);
+                    }
+                }
+                return;
+            }
+            let block = (self.block / k.rows).max(1);
+            let mut start = share.tiles.start;
+            while start < share.tiles.end {
+                let end = (start + block).min(share.tiles.end);
+                for panel in share.panels.clone() {
+                    for i in start..end {
+                        let rows = self.point(&mut tile, k, mem, i);
+                        self.panel(&mut tile, k, mem, panel, rows);
+                    }
+                }
+                start = end;
+            }
+        }
+    }
+
+    /// Points the tile at rows `i * k.rows ..`; returns how many there are.
+    #[inline]
+    unsafe fn point(&self, tile: &mut Tile, k: &Kernels, mem: Mem, i: usize) -> usize {
+        let first = i * k.rows;
+        let rows = k.rows.min(self.rows() - first);
+        let (mut y, mut x) = (first / self.size[1], first % self.size[1]);
+        let along = |p: Pitch, y: usize, x: usize| y * p.y + x * p.x;
+        // SAFETY: rows below `self.rows()`, which the check covers.
+        unsafe {
+            let input = mem.at(self.input);
+            for r in 0..rows {
+                tile.a[r] = input.add(along(self.input_pitch, y, x));
+                tile.c[r] = mem.arena.add(self.output + along(self.output_pitch, y, x));
+                if let Some((place, pitch)) = self.residual {
+                    tile.r[r] = mem.at(place).add(along(pitch, y, x));
+                }
+                x += 1;
+                if x == self.size[1] {
+                    (y, x) = (y + 1, 0);
+                }
+            }
+        }
+        rows
+    }
+
+    #[inline]
+    unsafe fn panel(&self, tile: &mut Tile, k: &Kernels, mem: Mem, panel: usize, rows: usize) {
+        tile.column = panel * k.packing.width;
+        tile.columns = k.packing.width.min(self.columns - tile.column);
+        let vectors = tile.columns.div_ceil(k.packing.lanes);
+        // SAFETY: the panel is inside the packed weights, and the tile is as the kernel wants it.
+        unsafe {
+            tile.b = mem.weights.add(self.weights + tile.column * self.depth());
+            (k.tiles[vectors - 1][rows - 1])(tile);
+        }
+    }
+}

@@ -1,0 +1,514 @@
+//! A checked list of steps, and how a team of threads goes through it.
+
+use super::attention::Attention;
+use super::{
+    Copy, Depthwise, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem, PackKv, Part,
+    Pitch, Place, Pool, Softmax, ThinAttention, Zip,
+};
+use crate::engine::native::sync::Barrier;
+
+/// Work below which a step is done by one thread: less than a few microseconds.
+const WORTH_SHARING: usize = 100_000;
+
+/// One call of a kernel.
+#[derive(Clone, Debug)]
+pub enum Step {
+    /// Zeros around a map whose kernel does not write them.
+    Clear(Halo),
+    /// Product with a constant matrix, or convolution.
+    Gemm(Gemm),
+    /// Convolution per channel.
+    Depthwise(Depthwise),
+    /// Maximum or mean over windows.
+    Pool(Pool),
+    /// Another layout.
+    Copy(Copy),
+    /// Function of one tensor.
+    Map(Map),
+    /// Function of two tensors.
+    Zip(Zip),
+    /// Reduction.
+    Fold(Fold),
+    /// Product of two computed tensors.
+    MatMul(MatMul),
+    /// Softmax of rows.
+    Softmax(Softmax),
+    /// Normalisation of rows.
+    LayerNorm(LayerNorm),
+    /// Normalisation of a map.
+    MapNorm(MapNorm),
+    /// Keys and values into panels.
+    PackKv(PackKv),
+    /// Attention over panels.
+    Attention(Attention),
+    /// Attention of few queries.
+    ThinAttention(ThinAttention),
+}
+
+/// What a step costs, for sharing and reports.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Cost {
+    /// Floating-point operations, about.
+    pub operations: usize,
+}
+
+/// Places that a step reads and writes, as runs of floats.
+#[derive(Debug, Default)]
+struct Spans {
+    reads: Vec<(Place, usize)>,
+    writes: Vec<(usize, usize)>,
+    /// What is wrong beyond places.
+    wrong: Option<&'static str>,
+}
+
+impl Spans {
+    fn read(&mut self, place: Place, len: usize) {
+        self.reads.push((place, len));
+    }
+
+    fn weights(&mut self, at: Option<usize>, len: usize) {
+        self.reads.extend(at.map(|at| (Place::Weights(at), len)));
+    }
+
+    fn write(&mut self, at: usize, len: usize) {
+        self.writes.push((at, len));
+    }
+
+    fn demand(&mut self, holds: bool, what: &'static str) {
+        if !holds {
+            self.wrong = Some(what);
+        }
+    }
+
+    /// A result of lines and pixels with its border.
+    fn map(&mut self, at: usize, size: [usize; 2], pitch: Pitch, run: usize, halo: Option<&Halo>) {
+        self.write(at, extent(size, pitch, run));
+        let apart = (size[1] == 1 || pitch.x >= run)
+            && (size[0] == 1 || pitch.y >= (size[1] - 1) * pitch.x + run);
+        self.demand(apart, "rows of its result overlap");
+        if let Some(halo) = halo {
+            self.border(halo);
+            let inner = halo.start + halo.width * (halo.line + halo.pixel);
+            let same = halo.size == size
+                && at == inner
+                && run <= halo.pixel
+                && (pitch.x == halo.pixel || size[1] == 1)
+                && (pitch.y == halo.line || size[0] == 1);
+            self.demand(same, "its border is not that of its result");
+        }
+    }
+
+    fn border(&mut self, halo: &Halo) {
+        self.write(halo.start, halo.len());
+        let wide = halo.line >= (halo.size[1] + 2 * halo.width) * halo.pixel;
+        self.demand(wide, "its border has lines that overlap");
+    }
+}
+
+/// Floats from the first to behind the last element.
+const fn extent(size: [usize; 2], pitch: Pitch, run: usize) -> usize {
+    (size[0] - 1) * pitch.y + (size[1] - 1) * pitch.x + run
+}
+
+fn farthest<const N: usize>(starts: &[[usize; N]], i: usize) -> usize {
+    starts.iter().map(|s| s[i]).max().unwrap_or(0)
+}
+
+impl Step {
+    /// Kind of kernel, for reports.
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Clear(_) => "clear",
+            Self::Gemm(s) if s.taps.len() > 1 || s.size[0] > 1 => "convolution",
+            Self::Gemm(_) => "linear",
+            Self::Depthwise(_) => "depthwise",
+            Self::Pool(_) => "pool",
+            Self::Copy(_) => "copy",
+            Self::Map(_) => "map",
+            Self::Zip(_) => "zip",
+            Self::Fold(_) => "reduce",
+            Self::MatMul(_) => "matmul",
+            Self::Softmax(_) => "softmax",
+            Self::LayerNorm(_) => "layer norm",
+            Self::MapNorm(_) => "map norm",
+            Self::PackKv(_) => "pack keys and values",
+            Self::Attention(_) => "attention",
+            Self::ThinAttention(_) => "attention of one query",
+        }
+    }
+
+    /// What it costs.
+    pub fn cost(&self) -> Cost {
+        let operations = match self {
+            Self::Clear(s) => s.len() / 4,
+            Self::Gemm(s) => 2 * s.rows() * s.columns * s.depth(),
+            Self::Depthwise(s) => 2 * s.size[0] * s.size[1] * s.channels * s.taps.len(),
+            Self::Pool(s) => s.size[0] * s.size[1] * s.channels * s.kernel[0] * s.kernel[1],
+            Self::Copy(s) => 2 * s.nest.len(),
+            Self::Map(s) => 4 * s.nest.len(),
+            Self::Zip(s) => 2 * s.nest.len(),
+            Self::Fold(s) => 4 * s.outer.len() * s.inner.len(),
+            Self::MatMul(s) => 2 * s.batch.len() * s.size.iter().product::<usize>(),
+            Self::Softmax(s) => 16 * s.size[0] * s.size[1] * s.columns,
+            Self::LayerNorm(s) => 8 * s.size[0] * s.size[1] * s.columns,
+            Self::MapNorm(s) => 8 * s.size[0] * s.size[1] * s.channels,
+            Self::PackKv(s) => 4 * s.heads.len() * s.size[0] * (s.size[1] + s.size[2]),
+            Self::Attention(s) => {
+                s.heads.len() * s.queries * s.size[0] * (2 * (s.size[1] + s.size[2]) + 16)
+            }
+            Self::ThinAttention(s) => {
+                s.heads.len() * s.queries * s.size[0] * (2 * (s.size[1] + s.size[2]) + 16)
+            }
+        };
+        Cost { operations }
+    }
+
+    /// Address and length of everything it uses of the arena.
+    pub fn arena_spans(&self, k: &Kernels, threads: usize) -> Vec<(usize, usize)> {
+        let spans = self.spans(k, threads);
+        let reads = spans.reads.into_iter().filter_map(|(place, len)| match place {
+            Place::Arena(at) => Some((at, len)),
+            Place::Weights(_) => None,
+        });
+        reads.chain(spans.writes).collect()
+    }
+
+    /// Moves every address in the arena.
+    pub fn relocate(&mut self, to: &impl Fn(usize) -> usize) {
+        let place = |place: &mut Place| {
+            if let Place::Arena(at) = place {
+                *at = to(*at);
+            }
+        };
+        let at = |at: &mut usize| *at = to(*at);
+        let border = |halo: &mut Option<Halo>| {
+            if let Some(halo) = halo {
+                at(&mut halo.start);
+            }
+        };
+        match self {
+            Self::Clear(halo) => at(&mut halo.start),
+            Self::Gemm(s) => {
+                place(&mut s.input);
+                if let Some((from, _)) = &mut s.residual {
+                    place(from);
+                }
+                at(&mut s.output);
+                border(&mut s.halo);
+            }
+            Self::Depthwise(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+                border(&mut s.halo);
+            }
+            Self::Pool(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+                border(&mut s.halo);
+            }
+            Self::Copy(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+            }
+            Self::Map(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+            }
+            Self::Zip(s) => {
+                s.inputs.iter_mut().for_each(place);
+                at(&mut s.output);
+            }
+            Self::Fold(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+            }
+            Self::MatMul(s) => {
+                place(&mut s.a);
+                place(&mut s.b);
+                at(&mut s.c);
+            }
+            Self::Softmax(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+            }
+            Self::LayerNorm(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+            }
+            Self::MapNorm(s) => {
+                place(&mut s.input);
+                at(&mut s.output);
+                border(&mut s.halo);
+            }
+            Self::PackKv(s) => {
+                place(&mut s.keys);
+                place(&mut s.values);
+                at(&mut s.output);
+            }
+            Self::Attention(s) => {
+                place(&mut s.input);
+                at(&mut s.panels);
+                at(&mut s.output);
+                at(&mut s.scratch);
+            }
+            Self::ThinAttention(s) => {
+                s.inputs.iter_mut().for_each(place);
+                at(&mut s.output);
+                at(&mut s.scratch);
+            }
+        }
+    }
+
+    fn spans(&self, k: &Kernels, threads: usize) -> Spans {
+        let mut spans = Spans::default();
+        match self {
+            Self::Clear(halo) => spans.border(halo),
+            Self::Gemm(s) => {
+                let reach = s.taps.iter().copied().max().unwrap_or(0) + s.run;
+                spans.read(s.input, extent(s.size, s.input_pitch, reach));
+                spans.weights(Some(s.weights), k.packing.len(s.depth(), s.columns));
+                spans.weights(s.bias, k.packing.columns(s.columns));
+                if let Some((place, pitch)) = s.residual {
+                    spans.read(place, extent(s.size, pitch, s.columns));
+                }
+                spans.map(s.output, s.size, s.output_pitch, s.columns, s.halo.as_ref());
+                spans.demand(s.columns > 0, "it has no columns");
+            }
+            Self::Depthwise(s) => {
+                let reach = s.taps.iter().copied().max().unwrap_or(0) + s.channels;
+                spans.read(s.input, extent(s.size, s.input_pitch, reach));
+                spans.weights(Some(s.weights), s.taps.len() * s.channels);
+                spans.weights(s.bias, s.channels);
+                spans.map(s.output, s.size, s.output_pitch, s.channels, s.halo.as_ref());
+            }
+            Self::Pool(s) => {
+                spans.read(s.input, extent(s.from, s.input_pitch, s.channels));
+                spans.map(s.output, s.size, s.output_pitch, s.channels, s.halo.as_ref());
+            }
+            Self::Copy(s) => {
+                spans.read(s.input, s.nest.extent(0));
+                spans.write(s.output, s.nest.extent(1));
+                spans.demand(s.nest.distinct(1), "elements of its result overlap");
+            }
+            Self::Map(s) => {
+                spans.read(s.input, s.nest.extent(0));
+                spans.write(s.output, s.nest.extent(1));
+                spans.demand(s.nest.distinct(1), "elements of its result overlap");
+            }
+            Self::Zip(s) => {
+                spans.read(s.inputs[0], s.nest.extent(0));
+                spans.read(s.inputs[1], s.nest.extent(1));
+                spans.write(s.output, s.nest.extent(2));
+                spans.demand(s.nest.distinct(2), "elements of its result overlap");
+            }
+            Self::Fold(s) => {
+                spans.read(s.input, s.outer.extent(0) + s.inner.extent(0) - 1);
+                spans.write(s.output, s.outer.extent(1));
+                spans.demand(s.outer.distinct(1), "elements of its result overlap");
+            }
+            Self::MatMul(s) => {
+                let [rows, sum, columns] = s.size;
+                spans.read(s.a, farthest(&s.batch, 0) + (rows - 1) * s.a_row + sum);
+                let b = (sum - 1) * s.b_sum + (columns - 1) * s.b_column + 1;
+                spans.read(s.b, farthest(&s.batch, 1) + b);
+                spans.demand(s.b_sum == 1 || s.b_column == 1, "neither side of `b` is a run");
+                let c = (rows - 1) * s.c_row + columns;
+                spans.write(s.c, farthest(&s.batch, 2) + c);
+                let starts = s.batch.iter().map(|b| b[2]);
+                spans.demand(blocks(starts, rows, s.c_row, columns), "its results overlap");
+            }
+            Self::Softmax(s) => {
+                spans.read(s.input, extent(s.size, s.input_pitch, s.columns));
+                spans.map(s.output, s.size, s.output_pitch, s.columns, None);
+            }
+            Self::LayerNorm(s) => {
+                spans.read(s.input, extent(s.size, s.input_pitch, s.columns));
+                spans.weights(Some(s.gain), s.columns);
+                spans.weights(s.offset, s.columns);
+                spans.map(s.output, s.size, s.output_pitch, s.columns, None);
+            }
+            Self::MapNorm(s) => {
+                spans.read(s.input, extent(s.size, s.input_pitch, s.channels));
+                spans.weights(s.gain, s.channels);
+                spans.weights(s.offset, s.channels);
+                spans.map(s.output, s.size, s.output_pitch, s.channels, s.halo.as_ref());
+            }
+            Self::PackKv(s) => {
+                let [count, key, value] = s.size;
+                let run = |n: usize, stride: [usize; 2], len: usize| {
+                    (n - 1) * stride[0] + (len - 1) * stride[1] + 1
+                };
+                spans.read(s.keys, farthest(&s.heads, 0) + run(count, s.key_stride, key));
+                spans.read(s.values, farthest(&s.heads, 1) + run(count, s.value_stride, value));
+                spans.write(s.output, s.heads.len() * PackKv::len(s.size, k).1);
+            }
+            Self::Attention(s) => {
+                let [keys, key, value] = s.size;
+                let queries = (s.queries - 1) * s.input_row + key;
+                spans.read(s.input, farthest(&s.heads, 0) + queries);
+                let panels = s.heads.len() * PackKv::len(s.size, k).1;
+                spans.read(Place::Arena(s.panels), panels);
+                let results = (s.queries - 1) * s.output_row + value;
+                spans.write(s.output, farthest(&s.heads, 1) + results);
+                spans.write(s.scratch, threads * Attention::scratch_len(keys));
+                let starts = s.heads.iter().map(|h| h[1]);
+                let apart = blocks(starts, s.queries, s.output_row, value);
+                spans.demand(apart, "its results overlap");
+            }
+            Self::ThinAttention(s) => {
+                let [keys, key, value] = s.size;
+                for (i, (n, run)) in
+                    [(s.queries, key), (keys, key), (keys, value)].into_iter().enumerate()
+                {
+                    let len = farthest(&s.heads, i) + (n - 1) * s.rows[i] + run;
+                    spans.read(s.inputs[i], len);
+                }
+                let results = (s.queries - 1) * s.output_row + value;
+                spans.write(s.output, farthest(&s.heads, 3) + results);
+                spans.write(s.scratch, threads * Attention::scratch_len(keys));
+                let starts = s.heads.iter().map(|h| h[3]);
+                let apart = blocks(starts, s.queries, s.output_row, value);
+                spans.demand(apart, "its results overlap");
+            }
+        }
+        spans
+    }
+
+    /// # Safety
+    /// The step was checked, and nobody else touches what it writes or writes what it reads.
+    unsafe fn run(&self, k: &Kernels, mem: Mem, part: Part) {
+        // SAFETY: passed on; the table fits the processor because `Isa::kernels` gave it out.
+        unsafe {
+            match self {
+                Self::Clear(halo) => {
+                    if part.id == 0 {
+                        halo.clear(mem);
+                    }
+                }
+                Self::Gemm(s) => s.run(k, mem, part),
+                Self::Depthwise(s) => (k.depthwise)(s, mem, part),
+                Self::Pool(s) => (k.pool)(s, mem, part),
+                Self::Copy(s) => s.run(mem, part),
+                Self::Map(s) => (k.map)(s, mem, part),
+                Self::Zip(s) => (k.zip)(s, mem, part),
+                Self::Fold(s) => (k.fold)(s, mem, part),
+                Self::MatMul(s) => (k.matmul)(s, mem, part),
+                Self::Softmax(s) => (k.softmax)(s, mem, part),
+                Self::LayerNorm(s) => (k.layer_norm)(s, mem, part),
+                Self::MapNorm(s) => (k.map_norm)(s, mem, part),
+                Self::PackKv(s) => s.run(k, mem, part),
+                Self::Attention(s) => k.attention(s, mem, part),
+                Self::ThinAttention(s) => (k.thin_attention)(s, mem, part),
+            }
+        }
+    }
+}
+
+/// Whether blocks of `rows` runs, `pitch` apart, that start at these places never overlap: no two
+/// runs do.
+fn blocks(starts: impl Iterator<Item = usize>, rows: usize, pitch: usize, run: usize) -> bool {
+    let mut runs: Vec<usize> =
+        starts.flat_map(|start| (0..rows).map(move |row| start + row * pitch)).collect();
+    runs.sort_unstable();
+    runs.windows(2).all(|w| w[1] - w[0] >= run)
+}
+
+/// Steps that were checked against sizes of arena and weights.
+#[derive(Debug)]
+pub struct Program {
+    steps: Box<[Planned]>,
+    arena: usize,
+    weights: usize,
+    threads: usize,
+    kernels: &'static Kernels,
+}
+
+#[derive(Debug)]
+struct Planned {
+    step: Step,
+    shared: bool,
+    /// Whether the threads wait for each other afterwards.
+    wait: bool,
+}
+
+impl Program {
+    /// Checks steps for an arena of `arena` floats, weights of `weights` floats, and a team.
+    ///
+    /// # Errors
+    /// With the index of the first step that would leave its places, and what is wrong with it.
+    pub fn new(
+        steps: Vec<Step>,
+        arena: usize,
+        weights: usize,
+        threads: usize,
+        kernels: &'static Kernels,
+    ) -> Result<Self, (usize, &'static str)> {
+        for (i, step) in steps.iter().enumerate() {
+            let spans = step.spans(kernels, threads);
+            check(&spans, arena, weights).map_err(|what| (i, what))?;
+        }
+        let shared: Vec<bool> =
+            steps.iter().map(|s| s.cost().operations >= WORTH_SHARING).collect();
+        let steps = steps.into_iter().enumerate().map(|(i, step)| {
+            // Steps of one thread need no waiting between them; the team waits after the last one.
+            let wait = shared.get(i + 1).is_some_and(|next| shared[i] || *next);
+            Planned { step, shared: shared[i], wait }
+        });
+        Ok(Self { steps: steps.collect(), arena, weights, threads, kernels })
+    }
+
+    /// Whether it was checked for these sizes.
+    pub(super) fn fits(&self, arena: usize, weights: usize, threads: usize, k: &Kernels) -> bool {
+        self.arena <= arena
+            && self.weights <= weights
+            && self.threads == threads
+            && core::ptr::eq(self.kernels, k)
+    }
+
+    /// One thread's part of everything.
+    ///
+    /// # Safety
+    /// All threads of the team run it together, on memory for which [`Self::fits`] holds and that
+    /// nobody else uses.
+    pub(super) unsafe fn run(&self, k: &Kernels, mem: Mem, part: Part, barrier: &Barrier) {
+        for planned in &self.steps {
+            // SAFETY: the steps were checked; each one starts after those before it are done.
+            unsafe {
+                if planned.shared {
+                    planned.step.run(k, mem, part);
+                } else if part.id == 0 {
+                    planned.step.run(k, mem, Part { id: 0, of: 1 });
+                }
+            }
+            if planned.wait {
+                barrier.wait();
+            }
+        }
+    }
+}
+
+fn check(spans: &Spans, arena: usize, weights: usize) -> Result<(), &'static str> {
+    if let Some(what) = spans.wrong {
+        return Err(what);
+    }
+    let inside =
+        |at: usize, len: usize, size: usize| at.checked_add(len).is_some_and(|e| e <= size);
+    for &(at, len) in &spans.writes {
+        if !inside(at, len, arena) {
+            return Err("it writes beyond the arena");
+        }
+    }
+    for &(place, len) in &spans.reads {
+        match place {
+            Place::Weights(at) if inside(at, len, weights) => {}
+            Place::Weights(_) => return Err("it reads beyond the weights"),
+            Place::Arena(at) if inside(at, len, arena) => {
+                if spans.writes.iter().any(|&(to, n)| at < to + n && to < at + len) {
+                    return Err("it writes what it reads");
+                }
+            }
+            Place::Arena(_) => return Err("it reads beyond the arena"),
+        }
+    }
+    Ok(())
+}

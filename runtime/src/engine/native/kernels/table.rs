@@ -1,0 +1,200 @@
+//! One table of functions per instruction set, and the choice among them.
+
+use super::attention::{self, Attention, ThinAttention};
+use super::conv::{self, Depthwise, Pool};
+use super::gemm::{self, Packing, Tile};
+use super::loops::{self, Fold, Map, Zip};
+use super::matmul::{self, MatMul};
+use super::norms::{self, LayerNorm, MapNorm, Softmax};
+use super::simd::{Scalar, Simd};
+use super::{Mem, Part};
+
+/// Most rows of a tile.
+pub const MAX_ROWS: usize = 12;
+/// Most vectors of columns of a tile.
+pub const MAX_VECTORS: usize = 2;
+
+type TileFn = unsafe fn(&Tile);
+
+/// Instruction sets that kernels are compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Isa {
+    /// Plain Rust.
+    Scalar,
+    /// x86-64 with AVX2 and FMA.
+    Avx2,
+    /// x86-64 with AVX-512F.
+    Avx512,
+    /// aarch64.
+    Neon,
+}
+
+impl Isa {
+    /// The best one of this processor.
+    pub fn best() -> Self {
+        [Self::Avx512, Self::Avx2, Self::Neon]
+            .into_iter()
+            .find(|isa| isa.kernels().is_some())
+            .unwrap_or(Self::Scalar)
+    }
+
+    /// Its functions, if this processor has it.
+    pub fn kernels(self) -> Option<&'static Kernels> {
+        match self {
+            Self::Scalar => Some(&SCALAR),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") => {
+                Some(&AVX2)
+            }
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 if is_x86_feature_detected!("avx512f") => Some(&AVX512),
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => Some(&NEON),
+            _ => None,
+        }
+    }
+
+    /// Name for reports.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Scalar => "scalar",
+            Self::Avx2 => "avx2",
+            Self::Avx512 => "avx512",
+            Self::Neon => "neon",
+        }
+    }
+}
+
+/// The functions of one instruction set. Calling one is unsafe: the processor must have the set,
+/// and the step must have been checked against the memory.
+#[derive(Debug)]
+pub struct Kernels {
+    /// Rows of a full tile.
+    pub rows: usize,
+    /// Layout of packed matrices.
+    pub packing: Packing,
+    pub(super) tiles: [[TileFn; MAX_ROWS]; MAX_VECTORS],
+    pub(super) depthwise: unsafe fn(&Depthwise, Mem, Part),
+    pub(super) pool: unsafe fn(&Pool, Mem, Part),
+    pub(super) layer_norm: unsafe fn(&LayerNorm, Mem, Part),
+    pub(super) softmax: unsafe fn(&Softmax, Mem, Part),
+    pub(super) map_norm: unsafe fn(&MapNorm, Mem, Part),
+    pub(super) map: unsafe fn(&Map, Mem, Part),
+    pub(super) zip: unsafe fn(&Zip, Mem, Part),
+    pub(super) fold: unsafe fn(&Fold, Mem, Part),
+    pub(super) matmul: unsafe fn(&MatMul, Mem, Part),
+    pub(super) thin_attention: unsafe fn(&ThinAttention, Mem, Part),
+    /// Softmax of `rows` rows in place, not divided by the sums, which go to `factors` inverted.
+    pub(super) weigh: unsafe fn(*mut f32, usize, usize, usize, f32, *mut f32),
+}
+
+impl Kernels {
+    /// Attention in tiles uses the tile functions directly.
+    pub(super) unsafe fn attention(&self, step: &Attention, mem: Mem, part: Part) {
+        // SAFETY: passed on.
+        unsafe { attention::run(step, self, mem, part) }
+    }
+}
+
+/// Makes the table of an instruction set. `$rows` is the height of its tile.
+macro_rules! table {
+    ($table:ident, $module:ident, $set:ty, $rows:tt, $feature:tt) => {
+        mod $module {
+            use super::*;
+            #[allow(unused_imports)]
+            use super::super::*;
+
+            table!(@each $set, $feature,
+                tile<R, NV>(t: &Tile) => gemm::tile::<$set, R, NV>(t);
+                depthwise(s: &Depthwise, m: Mem, p: Part) => conv::depthwise::<$set>(s, m, p);
+                pool(s: &Pool, m: Mem, p: Part) => conv::pool::<$set>(s, m, p);
+                layer_norm(s: &LayerNorm, m: Mem, p: Part) => norms::layer_norm::<$set>(s, m, p);
+                softmax(s: &Softmax, m: Mem, p: Part) => norms::softmax::<$set>(s, m, p);
+                map_norm(s: &MapNorm, m: Mem, p: Part) => norms::map_norm::<$set>(s, m, p);
+                map(s: &Map, m: Mem, p: Part) => loops::map(s, m, p);
+                zip(s: &Zip, m: Mem, p: Part) => loops::zip(s, m, p);
+                fold(s: &Fold, m: Mem, p: Part) => loops::fold(s, m, p);
+                matmul(s: &MatMul, m: Mem, p: Part) => matmul::matmul::<$set>(s, m, p);
+                thin(s: &ThinAttention, m: Mem, p: Part) => attention::thin::<$set>(s, m, p);
+                weigh(p: *mut f32, rows: usize, pitch: usize, n: usize, scale: f32, f: *mut f32)
+                    => norms::weigh::<$set>(p, rows, pitch, n, scale, f);
+            );
+
+            const fn tiles<const NV: usize>() -> [TileFn; MAX_ROWS] {
+                table!(@rows $rows, NV)
+            }
+
+            pub static TABLE: Kernels = Kernels {
+                rows: $rows,
+                packing: Packing {
+                    width: MAX_VECTORS * <$set as Simd>::LANES,
+                    lanes: <$set as Simd>::LANES,
+                },
+                tiles: [tiles::<1>(), tiles::<2>()],
+                depthwise,
+                pool,
+                layer_norm,
+                softmax,
+                map_norm,
+                map,
+                zip,
+                fold,
+                matmul,
+                thin_attention: thin,
+                weigh,
+            };
+        }
+        use $module::TABLE as $table;
+    };
+    (@each $set:ty, $feature:tt,
+        tile<R, NV>($t:ident: &Tile) => $tile:expr;
+        $($name:ident($($arg:ident: $type:ty),*) => $body:expr;)*) => {
+        table!(@one $feature tile[R, NV]($t: &Tile) => $tile);
+        $(
+            table!(@one $feature $name[]($($arg: $type),*) => $body);
+        )*
+    };
+    (@one () $name:ident[$($n:ident),*]($($arg:ident: $type:ty),*) => $body:expr) => {
+        unsafe fn $name<$(const $n: usize),*>($($arg: $type),*) {
+            // SAFETY: the caller promises a checked step.
+            unsafe { $body }
+        }
+    };
+    (@one ($feature:literal) $name:ident[$($n:ident),*]($($arg:ident: $type:ty),*) => $body:expr) => {
+        #[target_feature(enable = $feature)]
+        unsafe fn $name<$(const $n: usize),*>($($arg: $type),*) {
+            // SAFETY: the caller promises a checked step, the attribute the instruction set.
+            unsafe { $body }
+        }
+    };
+    // Rows above the tile's height are never asked for.
+    (@rows 12, $nv:ident) => {
+        [tile::<1, $nv>, tile::<2, $nv>, tile::<3, $nv>, tile::<4, $nv>, tile::<5, $nv>,
+         tile::<6, $nv>, tile::<7, $nv>, tile::<8, $nv>, tile::<9, $nv>, tile::<10, $nv>,
+         tile::<11, $nv>, tile::<12, $nv>]
+    };
+    (@rows 8, $nv:ident) => {
+        [tile::<1, $nv>, tile::<2, $nv>, tile::<3, $nv>, tile::<4, $nv>, tile::<5, $nv>,
+         tile::<6, $nv>, tile::<7, $nv>, tile::<8, $nv>, tile::<8, $nv>, tile::<8, $nv>,
+         tile::<8, $nv>, tile::<8, $nv>]
+    };
+    (@rows 6, $nv:ident) => {
+        [tile::<1, $nv>, tile::<2, $nv>, tile::<3, $nv>, tile::<4, $nv>, tile::<5, $nv>,
+         tile::<6, $nv>, tile::<6, $nv>, tile::<6, $nv>, tile::<6, $nv>, tile::<6, $nv>,
+         tile::<6, $nv>, tile::<6, $nv>]
+    };
+    (@rows 4, $nv:ident) => {
+        [tile::<1, $nv>, tile::<2, $nv>, tile::<3, $nv>, tile::<4, $nv>, tile::<4, $nv>,
+         tile::<4, $nv>, tile::<4, $nv>, tile::<4, $nv>, tile::<4, $nv>, tile::<4, $nv>,
+         tile::<4, $nv>, tile::<4, $nv>]
+    };
+}
+
+table!(SCALAR, scalar, Scalar, 4, ());
+#[cfg(target_arch = "x86_64")]
+table!(AVX2, avx2, x86::Avx2, 6, ("avx2,fma"));
+#[cfg(target_arch = "x86_64")]
+table!(AVX512, avx512, x86::Avx512, 12, ("avx512f"));
+#[cfg(target_arch = "aarch64")]
+table!(NEON, neon_table, neon::Neon, 8, ("neon"));

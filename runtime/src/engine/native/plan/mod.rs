@@ -1,0 +1,324 @@
+//! From graphs to programs: layouts chosen, weights packed, buffers placed.
+//!
+//! Maps `(1, C, H, W)` lie in memory with channels innermost and, where a convolution wants one,
+//! with a border of zeros; everything else lies as its maker left it, as a [`View`]. While a graph
+//! is lowered every buffer has an address of its own; when all graphs are known, buffers that are
+//! not in use at the same time get the same memory.
+
+mod arena;
+mod lower;
+mod rows;
+mod view;
+
+use super::graph::{Data, Graph, GraphError};
+use super::kernels::{Halo, Kernels, Program, Step};
+use arena::Life;
+use std::collections::HashMap;
+pub use view::{Base, View};
+
+/// Buffers, weights and lines start at multiples of this many floats, a cache line.
+const ALIGN: usize = 16;
+/// Addresses of buffers without a place yet; those below have one.
+const FLOATING: usize = usize::MAX / 2 + 1;
+
+type Result<T> = core::result::Result<T, GraphError>;
+
+/// What a constant is, whichever graph it is met in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+enum Source {
+    /// Bytes of the bundle, which graphs share.
+    Bytes(usize, usize),
+    /// A value that the reader made.
+    Value(usize, usize),
+}
+
+/// What has been made of a constant and can be used again.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+enum Made {
+    /// Its elements in the order of these sizes and strides from this offset.
+    Copy(Source, usize, Vec<usize>, Vec<usize>),
+    /// Packed for products, from this offset.
+    Packed(Source, usize, Vec<usize>, Vec<usize>),
+    /// Padded to whole vectors.
+    Padded(Source, usize),
+}
+
+/// Where inputs and outputs of graphs are.
+#[derive(Clone, Debug)]
+pub struct Binding<'n> {
+    /// Name in the graph.
+    pub name: &'n str,
+    /// Its place in the arena.
+    pub view: View,
+}
+
+/// A graph turned into steps.
+#[derive(Debug)]
+struct Routine {
+    name: String,
+    steps: Vec<Step>,
+    /// Name of the node behind every step.
+    nodes: Vec<String>,
+    /// Address and length of every floating buffer, ascending.
+    buffers: Vec<(usize, usize)>,
+}
+
+/// What a program consists of, for reports.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ProgramSummary {
+    /// Name of the graph.
+    pub name: String,
+    /// Kernel calls.
+    pub steps: usize,
+    /// Floating-point operations, about.
+    pub operations: usize,
+    /// Bytes of its buffers, when they share memory.
+    pub buffers: usize,
+    /// Bytes of its buffers if each had memory of its own.
+    pub unshared: usize,
+    /// Kernel calls and operations by kind, in order of first use.
+    pub kinds: Vec<(&'static str, usize, usize)>,
+}
+
+/// Everything a [`super::kernels::Team`] needs.
+#[derive(Debug)]
+pub struct Plan {
+    /// One per graph, in the order they were added; the first one runs once, at load.
+    pub programs: Vec<Program>,
+    /// See [`ProgramSummary`], in the same order.
+    pub summaries: Vec<ProgramSummary>,
+    /// Constants.
+    pub weights: Vec<f32>,
+    /// Floats of the arena.
+    pub arena: usize,
+    /// Floats at its start that live on between runs.
+    pub lasting: usize,
+}
+
+/// Collects graphs and what they share.
+#[derive(Debug)]
+pub struct Planner {
+    kernels: &'static Kernels,
+    threads: usize,
+    weights: Vec<f32>,
+    made: HashMap<Made, usize>,
+    lasting: usize,
+    /// Computed once, from constants only.
+    once: (Vec<Step>, Vec<String>),
+    /// Address and length of what that writes.
+    once_buffers: Vec<(usize, usize)>,
+    routines: Vec<Routine>,
+}
+
+impl Planner {
+    /// For an instruction set and a number of threads. `weights` is about how many floats there
+    /// will be.
+    pub fn new(kernels: &'static Kernels, threads: usize, weights: usize) -> Self {
+        Self {
+            kernels,
+            threads,
+            weights: Vec::with_capacity(weights),
+            made: HashMap::new(),
+            lasting: 0,
+            once: Default::default(),
+            once_buffers: Vec::new(),
+            routines: Vec::new(),
+        }
+    }
+
+    /// A buffer that lives on between runs; its address.
+    pub fn lasting(&mut self, len: usize) -> usize {
+        let at = self.lasting;
+        self.lasting += len.next_multiple_of(ALIGN);
+        at
+    }
+
+    /// A buffer that is written once, at load.
+    fn lasting_once(&mut self, len: usize) -> usize {
+        let at = self.lasting(len);
+        self.once_buffers.push((at, len));
+        at
+    }
+
+    /// Whether an address belongs to what is computed once.
+    fn is_once(&self, at: usize) -> bool {
+        self.once_buffers.iter().any(|b| (b.0..b.0 + b.1).contains(&at))
+    }
+
+    /// Lowers a graph whose inputs are read from, and whose outputs are written to, these places.
+    ///
+    /// # Errors
+    /// Names the node that cannot be run.
+    pub fn add(
+        &mut self,
+        name: &str,
+        graph: &Graph<'_>,
+        inputs: &[Binding<'_>],
+        outputs: &[Binding<'_>],
+    ) -> Result<()> {
+        let index = self.routines.len();
+        let routine = lower::lower(self, index, graph, inputs, outputs)?;
+        let (steps, nodes, buffers) = routine;
+        self.routines.push(Routine { name: name.into(), steps, nodes, buffers });
+        Ok(())
+    }
+
+    /// Places all buffers and checks all steps.
+    ///
+    /// # Errors
+    /// Names the node whose step does not keep within its buffers.
+    pub fn finish(self) -> Result<Plan> {
+        let Self { kernels, threads, weights, lasting, once, routines, .. } = self;
+        let once =
+            Routine { name: "once".into(), steps: once.0, nodes: once.1, buffers: Vec::new() };
+        let mut placed = Vec::with_capacity(routines.len() + 1);
+        let mut arena = lasting;
+        for mut routine in core::iter::once(once).chain(routines) {
+            let lives = lives(&routine, kernels, threads)?;
+            let (starts, len) = arena::place(&lives, ALIGN);
+            arena = arena.max(lasting + len);
+            let moved = |at: usize| match at.checked_sub(FLOATING) {
+                None => at,
+                Some(_) => {
+                    let i = routine.buffers.partition_point(|b| b.0 <= at) - 1;
+                    lasting + starts[i] + (at - routine.buffers[i].0)
+                }
+            };
+            routine.steps.iter_mut().for_each(|step| step.relocate(&moved));
+            let unshared: usize = lives.iter().map(|l| l.len).sum();
+            placed.push((routine, len, unshared));
+        }
+        let mut plan = Plan {
+            programs: Vec::with_capacity(placed.len()),
+            summaries: Vec::with_capacity(placed.len()),
+            arena,
+            lasting,
+            weights,
+        };
+        for (routine, len, unshared) in placed {
+            let mut summary = ProgramSummary {
+                name: routine.name,
+                steps: routine.steps.len(),
+                buffers: 4 * len,
+                unshared: 4 * unshared,
+                ..Default::default()
+            };
+            for step in &routine.steps {
+                let operations = step.cost().operations;
+                summary.operations += operations;
+                match summary.kinds.iter_mut().find(|k| k.0 == step.name()) {
+                    Some(kind) => (kind.1, kind.2) = (kind.1 + 1, kind.2 + operations),
+                    None => summary.kinds.push((step.name(), 1, operations)),
+                }
+            }
+            let nodes = routine.nodes;
+            let program = Program::new(routine.steps, arena, plan.weights.len(), threads, kernels)
+                .map_err(|(i, what)| fault(&nodes[i], what))?;
+            plan.programs.push(program);
+            plan.summaries.push(summary);
+        }
+        Ok(plan)
+    }
+
+    /// Appends to the weights; the place.
+    fn put(&mut self, values: &[f32]) -> usize {
+        self.weights.resize(self.weights.len().next_multiple_of(ALIGN), 0.0);
+        let at = self.weights.len();
+        self.weights.extend_from_slice(values);
+        at
+    }
+
+    /// The place of something made of a constant; it is made the first time.
+    fn make(&mut self, what: Made, values: impl FnOnce() -> Vec<f32>) -> usize {
+        if let Some(&at) = self.made.get(&what) {
+            return at;
+        }
+        let at = self.put(&values());
+        self.made.insert(what, at);
+        at
+    }
+}
+
+/// A step that the checks refuse: a mistake of this planner, told like any other.
+fn fault(node: &str, what: &str) -> GraphError {
+    GraphError::Node {
+        node: node.into(),
+        op: "plan".into(),
+        reason: format!("{what}; please report this with the bundle"),
+    }
+}
+
+/// First and last use of every buffer.
+fn lives(routine: &Routine, kernels: &'static Kernels, threads: usize) -> Result<Vec<Life>> {
+    let buffers = &routine.buffers;
+    let mut lives: Vec<Life> =
+        buffers.iter().map(|b| Life { len: b.1, first: usize::MAX, last: 0 }).collect();
+    for (i, step) in routine.steps.iter().enumerate() {
+        for (at, len) in step.arena_spans(kernels, threads) {
+            if at < FLOATING {
+                continue;
+            }
+            let index = buffers.partition_point(|b| b.0 <= at).checked_sub(1);
+            let Some(index) = index.filter(|&b| at + len <= buffers[b].0 + buffers[b].1) else {
+                return Err(fault(&routine.nodes[i], "it leaves its buffer"));
+            };
+            let life = &mut lives[index];
+            life.first = life.first.min(i);
+            life.last = life.last.max(i);
+        }
+    }
+    for life in &mut lives {
+        life.first = life.first.min(life.last);
+    }
+    Ok(lives)
+}
+
+/// Source of a constant of the graph with this index.
+fn source(graph: usize, value: usize, data: &Data<'_>) -> Source {
+    match data {
+        Data::Bytes(bytes) => Source::Bytes(bytes.as_ptr().addr(), bytes.len()),
+        _ => Source::Value(graph, value),
+    }
+}
+
+/// Elements of a constant in the order of a view.
+fn gather(data: &[f32], offset: usize, shape: &[usize], stride: &[usize]) -> Vec<f32> {
+    let len: usize = shape.iter().product();
+    let mut out = Vec::with_capacity(len);
+    let inner = shape.last().copied().unwrap_or(1);
+    let step = stride.last().copied().unwrap_or(1);
+    for i in 0..len / inner.max(1) {
+        let mut rest = i;
+        let mut at = offset;
+        for d in (0..shape.len().saturating_sub(1)).rev() {
+            at += rest % shape[d] * stride[d];
+            rest /= shape[d];
+        }
+        out.extend((0..inner).map(|k| data[at + k * step]));
+    }
+    out
+}
+
+/// A map's buffer: floats per pixel, per line and in all, for `(channels, height, width)`.
+#[derive(Clone, Copy, Debug)]
+struct MapLayout {
+    halo: Halo,
+    len: usize,
+}
+
+/// Layout of a map with a border of `width` zeros.
+fn map_layout(channels: usize, size: [usize; 2], width: usize) -> MapLayout {
+    // Whole cache lines per pixel; a few channels stay together, so that the pixels of a window's
+    // line are one run.
+    let mut pixel = if channels > ALIGN { channels.next_multiple_of(ALIGN) } else { channels };
+    pixel += spread(pixel);
+    let line = (size[1] + 2 * width) * pixel;
+    let halo = Halo { start: 0, size, width, line, pixel };
+    MapLayout { halo, len: (size[0] + 2 * width) * line }
+}
+
+/// Floats to add to a pitch of whole pages: rows that far apart compete for the same lines of the
+/// first-level cache.
+const fn spread(pitch: usize) -> usize {
+    if pitch > 0 && pitch.is_multiple_of(1024) { ALIGN } else { 0 }
+}
