@@ -165,36 +165,76 @@ pub unsafe fn tile<S: Simd, const R: usize, const NV: usize>(t: &Tile) {
                 }
             }
         }
-        let (low, high) = (S::splat(t.clamp.0), S::splat(t.clamp.1));
-        for j in 0..NV {
-            let at = t.column + j * S::LANES;
-            let n = (t.columns - j * S::LANES).min(S::LANES);
-            let bias = if t.bias.is_null() { S::splat(0.0) } else { S::load(t.bias.add(at)) };
+        // Every loop below is so small that it is unrolled and the sums stay in registers.
+        if !t.factors.is_null() {
             for r in 0..R {
-                let mut y = acc[r][j];
-                if !t.factors.is_null() {
-                    y = S::mul(y, S::splat(*t.factors.add(r)));
+                let factor = S::splat(*t.factors.add(r));
+                for j in 0..NV {
+                    acc[r][j] = S::mul(acc[r][j], factor);
                 }
-                y = S::add(y, bias);
+            }
+        }
+        if !t.bias.is_null() {
+            for j in 0..NV {
+                let bias = S::load(t.bias.add(t.column + j * S::LANES));
+                for r in 0..R {
+                    acc[r][j] = S::add(acc[r][j], bias);
+                }
+            }
+        }
+        if t.columns == NV * S::LANES {
+            if t.residual {
+                for r in 0..R {
+                    for j in 0..NV {
+                        let residual = S::load(t.r[r].add(t.column + j * S::LANES));
+                        acc[r][j] = S::add(acc[r][j], residual);
+                    }
+                }
+            }
+            let (low, high) = (S::splat(t.clamp.0), S::splat(t.clamp.1));
+            for r in 0..R {
+                for j in 0..NV {
+                    let y = S::at_most(high, S::at_least(low, acc[r][j]));
+                    S::store(t.c[r].add(t.column + j * S::LANES), y);
+                }
+            }
+            return;
+        }
+        let mut sums = [[[0.0f32; MAX_LANES]; NV]; R];
+        for r in 0..R {
+            for j in 0..NV {
+                S::store(sums[r][j].as_mut_ptr(), acc[r][j]);
+            }
+        }
+        ragged::<S, R, NV>(t, &sums);
+    }
+}
+
+/// Stores sums of which the last vector is not whole.
+#[inline(always)]
+unsafe fn ragged<S: Simd, const R: usize, const NV: usize>(
+    t: &Tile,
+    sums: &[[[f32; MAX_LANES]; NV]; R],
+) {
+    // SAFETY: as for `tile`.
+    unsafe {
+        let (low, high) = (S::splat(t.clamp.0), S::splat(t.clamp.1));
+        for (r, sums) in sums.iter().enumerate() {
+            for (j, sums) in sums.iter().enumerate() {
+                let at = t.column + j * S::LANES;
+                let n = (t.columns - j * S::LANES).min(S::LANES);
+                let mut y = S::load(sums.as_ptr());
                 if t.residual {
-                    y = S::add(y, load_some::<S>(t.r[r].add(at), n));
+                    y = S::add(y, S::load_n(t.r[r].add(at), n));
                 }
-                y = S::at_most(high, S::at_least(low, y));
-                if n == S::LANES {
-                    S::store(t.c[r].add(at), y);
-                } else {
-                    S::store_n(t.c[r].add(at), y, n);
-                }
+                S::store_n(t.c[r].add(at), S::at_most(high, S::at_least(low, y)), n);
             }
         }
     }
 }
 
-#[inline(always)]
-unsafe fn load_some<S: Simd>(p: *const f32, n: usize) -> S::V {
-    // SAFETY: the caller promises `n` floats and the instruction set.
-    unsafe { if n == S::LANES { S::load(p) } else { S::load_n(p, n) } }
-}
+/// Most floats of a vector of any instruction set.
+const MAX_LANES: usize = 16;
 
 /// Rows and panels that one thread computes.
 struct Share {
