@@ -8,9 +8,9 @@ use crate::bundle::WEIGHTS_FILE;
 use crate::engine::native::proto;
 use std::collections::HashMap;
 
-/// Most elements of one tensor: far above what a board can hold, low enough that no product of
-/// shapes wraps.
-const MAX_ELEMENTS: usize = 1 << 31;
+/// Most elements of one tensor: a quarter of a gigabyte, thirty times what the largest network of the
+/// family has.
+const MAX_ELEMENTS: usize = 1 << 26;
 /// Most dimensions of a tensor.
 pub const MAX_RANK: usize = 6;
 
