@@ -11,7 +11,10 @@ struct Random(u64);
 impl Random {
     fn fill(&mut self, out: &mut [f32], scale: f32) {
         for v in out {
-            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            self.0 = self
+                .0
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             *v = ((self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0) * scale;
         }
     }
@@ -49,7 +52,8 @@ fn random_inputs_give_what_tract_gives() {
     for seed in 0..3 {
         for (a, b) in drive(&mut native, seed).iter().zip(&drive(&mut tract, seed)) {
             let differences = a.iter().zip(b).map(|(x, y)| (x - y).abs());
-            largest = differences.fold(largest, |m, d| if d.is_nan() { f32::INFINITY } else { m.max(d) });
+            largest =
+                differences.fold(largest, |m, d| if d.is_nan() { f32::INFINITY } else { m.max(d) });
         }
     }
     println!("largest difference {largest:e}");

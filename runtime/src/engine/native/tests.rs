@@ -61,9 +61,9 @@ fn node(op: &str, inputs: &[&str], output: &str, attributes: Vec<Message>) -> Me
 }
 
 fn port(name: &str, shape: &[usize]) -> Message {
-    let dims = shape.iter().fold(Message::default(), |m, &n| {
-        m.sub(1, Message::default().int(1, n as i64))
-    });
+    let dims = shape
+        .iter()
+        .fold(Message::default(), |m, &n| m.sub(1, Message::default().int(1, n as i64)));
     let tensor = Message::default().int(1, 1).sub(2, dims);
     Message::default().bytes(1, name).sub(2, Message::default().sub(1, tensor))
 }
@@ -80,7 +80,12 @@ fn longs(name: &str, values: &[i64]) -> Message {
 }
 
 /// A model file: nodes, inputs, outputs, constants.
-fn model(nodes: Vec<Message>, inputs: Vec<Message>, outputs: Vec<Message>, constants: Vec<Message>) -> Vec<u8> {
+fn model(
+    nodes: Vec<Message>,
+    inputs: Vec<Message>,
+    outputs: Vec<Message>,
+    constants: Vec<Message>,
+) -> Vec<u8> {
     let fields = [(1, nodes), (5, constants), (11, inputs), (12, outputs)];
     let graph = fields.into_iter().fold(Message::default(), |m, (field, all)| {
         all.into_iter().fold(m, |m, part| m.sub(field, part))
@@ -134,7 +139,11 @@ fn template() -> Vec<u8> {
             node("Add", &["ft", "l"], "fl", vec![]),
             node("Add", &["fl", "mc"], "tokens", vec![]),
         ],
-        vec![port("ltrb", &[4, SIDE, SIDE]), port("feature", &[1, 4, SIDE, SIDE]), port("label", &[SIDE, SIDE])],
+        vec![
+            port("ltrb", &[4, SIDE, SIDE]),
+            port("feature", &[1, 4, SIDE, SIDE]),
+            port("label", &[SIDE, SIDE]),
+        ],
         vec![port("tokens", &[CELLS, 4])],
         vec![longs("flat", &[4, 9]), longs("column", &[9, 1])],
     )
@@ -284,8 +293,14 @@ fn what_is_wrong_with_a_bundle_is_named() {
     let cases: [(String, &[&str]); 10] = [
         (with(0, b"\xff\xff".to_vec()), &["features.onnx", "not readable"]),
         (with(0, Vec::new()), &["features.onnx", "no graph"]),
-        (with(0, features_with(kernel(), "Conv", 64)), &["features.onnx", "`feature`", "[1, 4, 4, 4]"]),
-        (with(0, features_with(kernel(), "Frobnicate", 48)), &["features.onnx", "Frobnicate_feature", "not supported"]),
+        (
+            with(0, features_with(kernel(), "Conv", 64)),
+            &["features.onnx", "`feature`", "[1, 4, 4, 4]"],
+        ),
+        (
+            with(0, features_with(kernel(), "Frobnicate", 48)),
+            &["features.onnx", "Frobnicate_feature", "not supported"],
+        ),
         (with(3, predict(2, 3, "Frobnicate")), &["predict2.onnx", "Frobnicate_ltrb"]),
         (with(2, predict(1, 4, "Exp")), &["predict1.onnx", "Reshape_fm", "[4, 4, 3]"]),
         (with(4, vec![0; 100]), &["features.onnx", "`kernel`", "outside the weights section"]),
@@ -311,7 +326,8 @@ fn evaluate(bytes: &[u8], x: (&[usize], &[f32]), y: &[usize]) -> Vec<f32> {
     let kernels = Isa::best().kernels().unwrap();
     let mut planner = Planner::new(kernels, 2, 0);
     let (from, to) = (planner.lasting(x.1.len()), planner.lasting(y.iter().product()));
-    let bind = |name, at, shape: &[usize]| Binding { name, view: View::dense(Base::Arena(at), shape) };
+    let bind =
+        |name, at, shape: &[usize]| Binding { name, view: View::dense(Base::Arena(at), shape) };
     planner.add("test", &graph, &[bind("x", from, x.0)], &[bind("y", to, y)]).unwrap();
     let plan = planner.finish().unwrap();
     let mut team = Team::new(plan.arena, &plan.weights, plan.programs, kernels, 2, false).unwrap();
@@ -395,12 +411,17 @@ fn unusual_convolutions() {
     let w: Vec<f32> = (0..6 * 2 * 4).map(|i| (i * 17 % 13) as f32 * 0.1 - 0.6).collect();
     let file = model(
         vec![
-            node("Conv", &["x", "w", "b"], "c", vec![
-                ints("pads", &[1, 0, 0, 2]),
-                ints("dilations", &[2, 1]),
-                ints("strides", &[1, 2]),
-                int("group", 2),
-            ]),
+            node(
+                "Conv",
+                &["x", "w", "b"],
+                "c",
+                vec![
+                    ints("pads", &[1, 0, 0, 2]),
+                    ints("dilations", &[2, 1]),
+                    ints("strides", &[1, 2]),
+                    int("group", 2),
+                ],
+            ),
             node("Relu", &["c"], "y", vec![]),
         ],
         vec![port("x", &[1, 4, 5, 6])],

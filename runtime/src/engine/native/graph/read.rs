@@ -575,7 +575,7 @@ impl<'a> Reader<'a> {
         let x = call.input(0)?;
         let from = self.shape(x);
         checked(&shape)?;
-        if from.iter().product::<usize>() != shape.iter().product() {
+        if from.iter().product::<usize>() != shape.iter().product::<usize>() {
             return Err(format!("from {from:?} to {shape:?}"));
         }
         self.push(call, Op::Reshape, vec![x], shape)

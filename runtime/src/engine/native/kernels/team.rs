@@ -15,7 +15,7 @@ const LINE: usize = 16;
 
 /// A cache line of floats.
 #[repr(align(64))]
-struct Line([f32; LINE]);
+struct Line(#[expect(dead_code, reason = "read and written through pointers")] [f32; LINE]);
 
 /// Memory of a fixed size, aligned to cache lines.
 struct Block(Box<[UnsafeCell<Line>]>);
