@@ -478,7 +478,8 @@ proptest! {
 #[test]
 fn functions_and_reductions() {
     let input = numbers(60, 1);
-    let functions: [(Unary, fn(f32) -> f32); 5] = [
+    type Function = fn(f32) -> f32;
+    let functions: [(Unary, Function); 5] = [
         (Unary::Clamp(-0.5, 0.5), |x| x.clamp(-0.5, 0.5)),
         (Unary::Exp, f32::exp),
         (Unary::Sigmoid, |x| 1.0 / (1.0 + (-x).exp())),
