@@ -1,20 +1,37 @@
 //! Meeting points of the worker threads: a short spin, then sleep. Nothing here allocates; the only
 //! system calls are those that put a thread to sleep and wake it.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
-/// Turns of the spin before a thread goes to sleep, about 20 microseconds: longer than the gap
-/// between two threads that finish a step, shorter than a scheduling slice of a busy machine.
-const SPIN: u32 = 2_000;
+/// Most turns of the spin before a thread goes to sleep, about 20 microseconds: longer than the gap
+/// between two threads that finish a step.
+const MAX_SPIN: u32 = 2_000;
+/// Fewest turns. Where two threads share a core every spin is in vain, so it is halved each time it
+/// did not help, and doubled each time it did.
+const MIN_SPIN: u32 = 50;
 
 /// A counter that threads can wait for.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Signal {
     count: AtomicUsize,
+    /// Turns of the next spin; a hint, so nothing depends on its order.
+    spin: AtomicU32,
     sleepers: AtomicUsize,
     lock: Mutex<()>,
     wake: Condvar,
+}
+
+impl Default for Signal {
+    fn default() -> Self {
+        Self {
+            count: AtomicUsize::new(0),
+            spin: AtomicU32::new(MAX_SPIN),
+            sleepers: AtomicUsize::new(0),
+            lock: Mutex::new(()),
+            wake: Condvar::new(),
+        }
+    }
 }
 
 impl Signal {
@@ -36,12 +53,17 @@ impl Signal {
 
     /// Returns when the count is no longer `seen`.
     pub fn wait(&self, seen: usize) {
-        for _ in 0..SPIN {
+        let spin = self.spin.load(Ordering::Relaxed);
+        for _ in 0..spin {
             if self.count() != seen {
+                if spin < MAX_SPIN {
+                    self.spin.store((spin * 2).min(MAX_SPIN), Ordering::Relaxed);
+                }
                 return;
             }
             core::hint::spin_loop();
         }
+        self.spin.store((spin / 2).max(MIN_SPIN), Ordering::Relaxed);
         let mut guard = self.locked();
         self.sleepers.fetch_add(1, Ordering::SeqCst);
         while self.count.load(Ordering::SeqCst) == seen {

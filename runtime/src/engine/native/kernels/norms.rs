@@ -251,22 +251,30 @@ pub unsafe fn weigh<S: Simd>(
         for row in 0..rows {
             let p = first.add(row * pitch);
             let whole = n / S::LANES * S::LANES;
-            let mut top = S::splat(f32::NEG_INFINITY);
+            let mut top = [S::splat(f32::NEG_INFINITY); 4];
             let mut at = 0;
+            while at + 4 * S::LANES <= whole {
+                for (i, top) in top.iter_mut().enumerate() {
+                    *top = S::at_least(*top, S::load(p.add(at + i * S::LANES)));
+                }
+                at += 4 * S::LANES;
+            }
             while at < whole {
-                top = S::at_least(top, S::load(p.add(at)));
+                top[0] = S::at_least(top[0], S::load(p.add(at)));
                 at += S::LANES;
             }
-            let mut max = S::top(top);
+            let mut max =
+                S::top(S::at_least(S::at_least(top[0], top[1]), S::at_least(top[2], top[3])));
             while at < n {
                 max = max.max(*p.add(at));
                 at += 1;
             }
-            let max = S::splat(max);
+            // scale x - scale max in one operation.
+            let shift = S::mul(S::splat(-max), scale);
             let mut sum = S::splat(0.0);
             let mut at = 0;
             while at < whole {
-                let v = S::mul(S::sub(S::load(p.add(at)), max), scale);
+                let v = S::fma(S::load(p.add(at)), scale, shift);
                 let e = simd::exp::<S>(v);
                 sum = S::add(sum, e);
                 S::store(p.add(at), e);
@@ -275,7 +283,7 @@ pub unsafe fn weigh<S: Simd>(
             let mut total = S::sum(sum);
             if at < n {
                 let lanes = n - at;
-                let v = S::mul(S::sub(S::load_n(p.add(at), lanes), max), scale);
+                let v = S::fma(S::load_n(p.add(at), lanes), scale, shift);
                 S::store_n(p.add(at), simd::exp::<S>(v), lanes);
                 total += S::sum(S::load_n(p.add(at), lanes));
             }
