@@ -18,7 +18,7 @@ use burn::module::Module as _;
 use burn::tensor::{Device, Tensor, TensorData};
 use std::collections::HashMap;
 use tsda_runtime::bundle::{Bundle, Manifest, Provenance, TrainedOn};
-use tsda_runtime::engine::tract::TractEngine;
+use tsda_runtime::engine::{NativeEngine, TractEngine};
 use tsda_runtime::{Engine, EngineError, ModelSpec, TrackerParams};
 use tsda_trainer::import::{StateDict, StateTensor};
 use tsda_trainer::model::TrackerNet;
@@ -47,6 +47,8 @@ pub enum EngineKind {
     Burn,
     /// burn on a GPU through Vulkan or WebGPU; cargo feature `wgpu`.
     Wgpu,
+    /// Our own engine.
+    Native,
     /// tract.
     Tract,
     /// ONNX Runtime; cargo feature `ort`.
@@ -55,9 +57,10 @@ pub enum EngineKind {
 
 impl EngineKind {
     /// All of them, with the name on the command line and whether this program has it.
-    pub const ALL: [(Self, &'static str, bool); 4] = [
+    pub const ALL: [(Self, &'static str, bool); 5] = [
         (Self::Burn, "burn", true),
         (Self::Wgpu, "wgpu", cfg!(feature = "wgpu")),
+        (Self::Native, "native", true),
         (Self::Tract, "tract", true),
         (Self::Ort, "ort", cfg!(feature = "ort")),
     ];
@@ -87,6 +90,7 @@ impl EngineKind {
             }
             #[cfg(not(feature = "wgpu"))]
             Self::Wgpu => absent("wgpu"),
+            Self::Native => on_engine("native", net, NativeEngine::from_bundle, graphs::native),
             Self::Tract => on_engine("tract", net, TractEngine::from_bundle, graphs::tract),
             #[cfg(feature = "ort")]
             Self::Ort => on_engine(

@@ -8,6 +8,7 @@ use burn::tensor::Tensor;
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use tsda_runtime::bundle::SectionKind;
+use tsda_runtime::engine::native::GraphSession as NativeSession;
 #[cfg(feature = "ort")]
 use tsda_runtime::engine::ort::graph::GraphSession;
 use tsda_trainer::model::TrackerNet;
@@ -241,6 +242,48 @@ pub fn tract(file: &[u8]) -> Result<Box<dyn Session>, String> {
     }
 }
 
+impl Session for NativeSession {
+    fn run(
+        &mut self,
+        inputs: &[(&str, &[f32])],
+        outputs: &[&str],
+    ) -> Result<Vec<Vec<f32>>, String> {
+        for (name, values) in inputs {
+            fill(name, self.input_mut(name), values)?;
+        }
+        NativeSession::run(self);
+        let values = |name: &&str| match self.output(name) {
+            Some(values) => Ok(values.to_vec()),
+            None => Err(format!("there is no output `{name}`")),
+        };
+        outputs.iter().map(values).collect()
+    }
+}
+
+/// Loads a graph into our own engine.
+///
+/// # Errors
+/// What it said.
+pub fn native(file: &[u8]) -> Result<Box<dyn Session>, String> {
+    match NativeSession::new(file) {
+        Ok(session) => Ok(Box::new(session)),
+        Err(e) => Err(e.to_string()),
+    }
+}
+
+fn fill(name: &str, input: Option<&mut [f32]>, values: &[f32]) -> Result<(), String> {
+    let input = input.ok_or(format!("there is no input `{name}`"))?;
+    if input.len() != values.len() {
+        return Err(format!(
+            "input `{name}` has {} numbers, {} were given",
+            input.len(),
+            values.len()
+        ));
+    }
+    input.copy_from_slice(values);
+    Ok(())
+}
+
 #[cfg(feature = "ort")]
 impl Session for GraphSession {
     fn run(
@@ -249,15 +292,7 @@ impl Session for GraphSession {
         outputs: &[&str],
     ) -> Result<Vec<Vec<f32>>, String> {
         for (name, values) in inputs {
-            let input = self.input_mut(name).ok_or(format!("there is no input `{name}`"))?;
-            if input.len() != values.len() {
-                return Err(format!(
-                    "input `{name}` has {} numbers, {} were given",
-                    input.len(),
-                    values.len()
-                ));
-            }
-            input.copy_from_slice(values);
+            fill(name, self.input_mut(name), values)?;
         }
         GraphSession::run(self).map_err(|e| e.to_string())?;
         outputs

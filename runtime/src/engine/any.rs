@@ -3,6 +3,8 @@
 //! Grammar: `NAME[:PROVIDER][,KEY[=VALUE]]..`, described in `docs/engines.md`. To add an engine: a
 //! variant of [`EngineChoice`] and of [`AnyEngine`], and a line in every `match` of this file.
 
+#[cfg(feature = "native")]
+use super::native::{Isa, NativeEngine, NativeOptions};
 #[cfg(feature = "ort")]
 use super::ort::{OrtEngine, OrtError, OrtLibrary, OrtOptions};
 #[cfg(feature = "tract")]
@@ -17,6 +19,9 @@ use core::str::FromStr;
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum EngineChoice {
+    /// Our own engine.
+    #[cfg(feature = "native")]
+    Native(NativeOptions),
     /// tract.
     #[cfg(feature = "tract")]
     Tract,
@@ -71,11 +76,15 @@ impl OpenError {
 /// The engine that programs use when nobody names one.
 impl Default for EngineChoice {
     fn default() -> Self {
-        #[cfg(feature = "tract")]
+        #[cfg(feature = "native")]
+        {
+            Self::Native(NativeOptions::default())
+        }
+        #[cfg(all(feature = "tract", not(feature = "native")))]
         {
             Self::Tract
         }
-        #[cfg(not(feature = "tract"))]
+        #[cfg(not(any(feature = "native", feature = "tract")))]
         {
             Self::Ort(OrtOptions::default())
         }
@@ -86,6 +95,8 @@ impl EngineChoice {
     /// Every engine of this build, on the processor.
     pub fn compiled() -> Vec<Self> {
         vec![
+            #[cfg(feature = "native")]
+            Self::Native(NativeOptions::default()),
             #[cfg(feature = "tract")]
             Self::Tract,
             #[cfg(feature = "ort")]
@@ -99,6 +110,14 @@ impl EngineChoice {
     /// When the engine cannot do it.
     pub fn with_threads(self, threads: usize) -> Result<Self, ChoiceError> {
         match self {
+            #[cfg(feature = "native")]
+            Self::Native(options) => {
+                let threads = native_threads(threads).map_err(|reason| ChoiceError {
+                    text: Self::Native(options).to_string(),
+                    reason,
+                })?;
+                Ok(Self::Native(NativeOptions { threads, ..options }))
+            }
             #[cfg(feature = "tract")]
             Self::Tract if threads == 1 => Ok(self),
             #[cfg(feature = "tract")]
@@ -117,6 +136,10 @@ impl EngineChoice {
     /// When it is not there on this machine, or refuses the bundle.
     pub fn open(&self, bundle: &Bundle<'_>) -> Result<AnyEngine, OpenError> {
         Ok(match self {
+            #[cfg(feature = "native")]
+            Self::Native(options) => {
+                AnyEngine::Native(Box::new(NativeEngine::with_options(bundle, *options)?))
+            }
             #[cfg(feature = "tract")]
             Self::Tract => AnyEngine::Tract(Box::new(TractEngine::from_bundle(bundle)?)),
             #[cfg(feature = "ort")]
@@ -132,6 +155,12 @@ impl EngineChoice {
     /// When it is not there on this machine.
     pub fn describe(&self) -> Result<String, OpenError> {
         Ok(match self {
+            #[cfg(feature = "native")]
+            Self::Native(options) => format!(
+                "{self}: our own, pure Rust, compiled in, {} instructions, {} thread(s)",
+                options.isa.unwrap_or_else(Isa::best).name(),
+                options.threads
+            ),
             #[cfg(feature = "tract")]
             Self::Tract => "tract: pure Rust, compiled in, processor, one thread".into(),
             #[cfg(feature = "ort")]
@@ -148,6 +177,48 @@ impl EngineChoice {
     }
 }
 
+/// Most threads the native engine takes.
+#[cfg(feature = "native")]
+const MOST_THREADS: usize = 64;
+
+/// A number of threads as typed: 0 for one per core.
+#[cfg(feature = "native")]
+fn native_threads(threads: usize) -> Result<usize, String> {
+    match threads {
+        0 => Ok(std::thread::available_parallelism().map_or(1, usize::from).min(MOST_THREADS)),
+        1..=MOST_THREADS => Ok(threads),
+        _ => Err(format!("{threads} threads; at most {MOST_THREADS} are possible")),
+    }
+}
+
+/// Reads `,threads=N,pin,isa=NAME`.
+#[cfg(feature = "native")]
+fn native_options(text: &str) -> Result<NativeOptions, String> {
+    const KNOWN: &str = "threads=N, pin and isa=NAME are";
+    let mut options = NativeOptions::default();
+    if text.starts_with(':') {
+        return Err(format!("it has no providers; {KNOWN} possible after a comma"));
+    }
+    for part in text.split(',').skip(1) {
+        match part.split_once('=') {
+            Some(("threads", n)) => {
+                let n = n.parse().map_err(|_| format!("`{n}` is no number of threads"))?;
+                options.threads = native_threads(n)?;
+            }
+            Some(("isa", name)) => {
+                let found = Isa::available().into_iter().find(|isa| isa.name() == name);
+                options.isa = Some(found.ok_or_else(|| {
+                    let names: Vec<_> = Isa::available().into_iter().map(Isa::name).collect();
+                    format!("this processor has {}, not `{name}`", names.join(", "))
+                })?);
+            }
+            None if part == "pin" => options.pin = true,
+            _ => return Err(format!("`{part}` is not known; {KNOWN}")),
+        }
+    }
+    Ok(options)
+}
+
 impl FromStr for EngineChoice {
     type Err = ChoiceError;
 
@@ -155,6 +226,8 @@ impl FromStr for EngineChoice {
         let fail = |reason: String| ChoiceError { text: text.into(), reason };
         let (name, rest) = text.split_at(text.find([':', ',']).unwrap_or(text.len()));
         match name {
+            #[cfg(feature = "native")]
+            "native" => native_options(rest).map(Self::Native).map_err(fail),
             #[cfg(feature = "tract")]
             "tract" if rest.is_empty() => Ok(Self::Tract),
             #[cfg(feature = "tract")]
@@ -173,6 +246,17 @@ impl FromStr for EngineChoice {
 impl fmt::Display for EngineChoice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            #[cfg(feature = "native")]
+            Self::Native(options) => {
+                f.write_str("native")?;
+                if options.threads != 1 {
+                    write!(f, ",threads={}", options.threads)?;
+                }
+                if options.pin {
+                    f.write_str(",pin")?;
+                }
+                options.isa.map_or(Ok(()), |isa| write!(f, ",isa={}", isa.name()))
+            }
             #[cfg(feature = "tract")]
             Self::Tract => f.write_str("tract"),
             #[cfg(feature = "ort")]
@@ -185,6 +269,9 @@ impl fmt::Display for EngineChoice {
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum AnyEngine {
+    /// Our own engine.
+    #[cfg(feature = "native")]
+    Native(Box<NativeEngine>),
     /// tract.
     #[cfg(feature = "tract")]
     Tract(Box<TractEngine>),
@@ -196,6 +283,8 @@ pub enum AnyEngine {
 macro_rules! inner {
     ($any:expr, $engine:ident => $call:expr) => {
         match $any {
+            #[cfg(feature = "native")]
+            Self::Native($engine) => $call,
             #[cfg(feature = "tract")]
             Self::Tract($engine) => $call,
             #[cfg(feature = "ort")]
@@ -249,9 +338,26 @@ mod tests {
 
     #[test]
     fn other_names_are_refused() {
-        for text in ["", "onnx", "tractor", ":cuda", "ort:gpu", "ort,turbo", "tract:cuda"] {
+        for text in
+            ["", "onnx", "tractor", ":cuda", "ort:gpu", "ort,turbo", "tract:cuda", "native:cuda"]
+        {
             let error = text.parse::<EngineChoice>().unwrap_err();
             assert!(error.to_string().contains(&format!("`{text}`")), "{error}");
+        }
+    }
+
+    #[cfg(feature = "native")]
+    #[test]
+    fn options_of_the_native_engine_are_read_and_written() {
+        for text in ["native", "native,threads=3", "native,threads=2,pin", "native,isa=scalar"] {
+            assert_eq!(text.parse::<EngineChoice>().unwrap().to_string(), text);
+        }
+        let one: EngineChoice = "native".parse().unwrap();
+        assert_eq!(one.clone().with_threads(2).unwrap().to_string(), "native,threads=2");
+        assert!(one.clone().with_threads(65).is_err());
+        assert!(matches!(one.with_threads(0), Ok(EngineChoice::Native(o)) if o.threads > 0));
+        for text in ["native,threads=x", "native,isa=abacus", "native,fast", "native,threads=900"] {
+            assert!(text.parse::<EngineChoice>().is_err(), "{text}");
         }
     }
 

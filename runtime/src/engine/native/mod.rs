@@ -10,6 +10,7 @@ mod graph;
 mod kernels;
 mod plan;
 mod proto;
+mod session;
 mod sync;
 #[cfg(test)]
 mod tests;
@@ -24,6 +25,7 @@ use std::ops::Range;
 
 pub use kernels::Isa;
 pub use plan::ProgramSummary;
+pub use session::GraphSession;
 
 const NAME: &str = "native";
 /// Most threads of one engine.
@@ -267,7 +269,7 @@ impl<'a> Graphs<'a> {
             let mut graph = graph::read(bytes, weights)
                 .map_err(|e| error(Stage::Load, format_args!("{kind}: {e}")))?;
             graph::fuse(&mut graph);
-            Ok(graph)
+            Ok::<_, EngineError>(graph)
         };
         Ok(Self {
             features: read(SectionKind::FeaturesOnnx)?,

@@ -39,6 +39,12 @@ impl Isa {
             .unwrap_or(Self::Scalar)
     }
 
+    /// Those this processor has.
+    pub fn available() -> Vec<Self> {
+        let all = [Self::Scalar, Self::Avx2, Self::Avx512, Self::Neon];
+        all.into_iter().filter(|isa| isa.kernels().is_some()).collect()
+    }
+
     /// Its functions, if this processor has it.
     pub fn kernels(self) -> Option<&'static Kernels> {
         match self {
