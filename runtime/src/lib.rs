@@ -2,14 +2,14 @@
 //!
 //! The way through the crate, in the order a frame takes it:
 //! 1. [`bundle`] reads a `.tsda` file: network specification, thresholds, ONNX graphs, weights.
-//! 2. An [`engine`] is built from it (tract, ONNX Runtime, or one of your own).
+//! 2. An [`engine`] is built from it (native, tract, ONNX Runtime, or one of your own).
 //! 3. A [`Tracker`] is built on the engine and given the first frame with its box.
 //! 4. Every later frame goes through [`Tracker::update`]: [`crop`] cuts the search area out of the
 //!    sensor's buffer, the engine scores it, [`localise`] reads the maps, [`memory`] decides what to
 //!    keep.
 //!
-//! Without features the crate is `no_std` and never allocates; `std` adds file reading, `tract` and
-//! `ort` add engines. Section numbers in the docs ("spec 3.4") are those of the tracker
+//! Without features the crate is `no_std` and never allocates; `std` adds file reading, `native`,
+//! `tract` and `ort` add engines. Section numbers in the docs ("spec 3.4") are those of the tracker
 //! specification summarised in `docs/tracker.md`.
 #![cfg_attr(not(any(feature = "std", test)), no_std)]
 
