@@ -18,7 +18,7 @@ pub(crate) struct GoldenArgs {
     /// Shape of the network: tomp101, tomp50, nano or small.
     #[arg(long)]
     preset: String,
-    /// Back end: burn, wgpu, tract, ort or all (of those compiled in); may be repeated.
+    /// Back end: burn, wgpu, native, tract, ort or all (of those compiled in); may be repeated.
     #[arg(long, default_value = "all")]
     engine: Vec<String>,
     /// Only this file of figures.

@@ -71,7 +71,7 @@ enum Command {
         /// Largest absolute difference allowed.
         #[arg(long, default_value_t = 1e-4, value_parser = tolerance)]
         tolerance: f32,
-        /// Only this engine: tract, ort, ort:cuda, ort:tensorrt (docs/engines.md) [default: every
+        /// Only this engine: native, tract, ort, ort:cuda, ort:tensorrt (docs/engines.md) [default: every
         /// one of this build that is on the machine].
         #[arg(long)]
         engine: Option<EngineChoice>,

@@ -7,7 +7,7 @@ use tsda_runtime::engine::EngineChoice;
 /// `--engine` and `--threads` of a command that tracks.
 #[derive(Clone, Debug, Default, Args)]
 pub struct EngineArgs {
-    /// tract, ort, ort:cuda or ort:tensorrt; options follow after commas, such as
+    /// native, tract, ort, ort:cuda or ort:tensorrt; options follow after commas, such as
     /// ort:tensorrt,fp16,cache=DIR (docs/engines.md)
     #[arg(long, value_name = "ENGINE", default_value_t)]
     pub engine: EngineChoice,
@@ -51,7 +51,9 @@ mod tests {
         assert_eq!(choice(&[]).expect("default"), EngineChoice::default());
         assert_eq!(choice(&["--engine", "tract"]).expect("tract").to_string(), "tract");
         assert!(choice(&["--engine", "tract", "--threads", "1"]).is_ok());
-        let error = choice(&["--threads", "4"]).expect_err("tract has one thread").to_string();
+        assert_eq!(choice(&["--threads", "4"]).expect("native").to_string(), "native,threads=4");
+        let error = choice(&["--engine", "tract", "--threads", "4"]);
+        let error = error.expect_err("tract has one thread").to_string();
         assert!(error.contains("--threads 4") && error.contains("one thread"), "{error}");
         let error = parse(&["--engine", "abacus"]).expect_err("no such engine").to_string();
         assert!(error.contains("`abacus`") && error.contains("tract"), "{error}");

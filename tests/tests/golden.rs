@@ -11,12 +11,10 @@ use tsda_trainer::model::{NetOptions, TrackerNet};
 
 /// The back ends of this build. ONNX Runtime only where its library is found.
 fn engines() -> Vec<EngineKind> {
-    let mut engines = vec![EngineKind::Burn, EngineKind::Tract];
-    if cfg!(feature = "ort") {
-        match std::env::var_os("TSDA_ORT_LIB").or_else(|| std::env::var_os("ORT_DYLIB_PATH")) {
-            Some(_) => engines.push(EngineKind::Ort),
-            None => println!("skipped: ort, TSDA_ORT_LIB does not say where ONNX Runtime is"),
-        }
+    let mut engines = vec![EngineKind::Burn, EngineKind::Native, EngineKind::Tract];
+    match std::env::var_os("TSDA_ORT_LIB").or_else(|| std::env::var_os("ORT_DYLIB_PATH")) {
+        Some(_) => engines.push(EngineKind::Ort),
+        None => println!("skipped: ort, TSDA_ORT_LIB does not say where ONNX Runtime is"),
     }
     engines
 }

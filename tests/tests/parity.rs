@@ -2,12 +2,13 @@
 
 use tsda_export::{bundle, network};
 use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, Provenance, SectionKind, TrainedOn};
-use tsda_runtime::engine::tract::TractEngine;
+use tsda_runtime::engine::{EngineChoice, NativeEngine, NativeOptions, TractEngine};
 use tsda_runtime::probe::{self, Probe};
-use tsda_runtime::{BBox, FrameView, ModelSpec, Tracker, TrackerParams};
+use tsda_runtime::{BBox, Engine, FrameView, ModelSpec, Tracker, TrackerParams};
 use tsda_trainer::burn_engine::BurnEngine;
+use tsda_trainer::model::TrackerNet;
 
-/// Largest difference allowed between burn and tract on score map and ltrb.
+/// Largest difference allowed between burn and an engine on score map and ltrb.
 const TOLERANCE: f32 = 1e-4;
 
 #[test]
@@ -16,10 +17,13 @@ fn the_shipped_bundle_repeats_the_trainers_numbers() {
     let bundle = file.bundle().unwrap();
     let spec = bundle.manifest().spec;
     let probe = Probe::parse(bundle.require(SectionKind::Probe).unwrap(), &spec).unwrap();
-    let mut engine = TractEngine::from_bundle(&bundle).unwrap();
-    let report = probe::run(&mut engine, &probe).unwrap();
-    println!("nano.tsda, tract against burn, probe: {:e}", report.max());
-    assert!(report.max() <= TOLERANCE, "{report:?}");
+    let engines = [EngineChoice::Native(NativeOptions::default()), EngineChoice::Tract];
+    for choice in engines {
+        let mut engine = choice.open(&bundle).unwrap();
+        let report = probe::run(&mut engine, &probe).unwrap();
+        println!("nano.tsda, {choice} against burn, probe: {:e}", report.max());
+        assert!(report.max() <= TOLERANCE, "{choice}: {report:?}");
+    }
 }
 
 /// The recipe picture, seen through a window that moves by 3 pixels per frame.
@@ -33,7 +37,7 @@ const WIDTH: usize = 320;
 const HEIGHT: usize = 240;
 
 #[test]
-fn burn_and_tract_drive_the_tracker_alike() {
+fn burn_and_the_engines_drive_the_tracker_alike() {
     let spec = ModelSpec::NANO;
     // Random weights: nothing in this test depends on what ships.
     let net = network::untrained(&spec, 3).unwrap();
@@ -54,12 +58,18 @@ fn burn_and_tract_drive_the_tracker_alike() {
     };
     let bytes =
         bundle::encode(&manifest, &network::files(&network::graphs(&net).unwrap())).unwrap();
-    let tract = TractEngine::from_bundle(&Bundle::parse(&bytes).unwrap()).unwrap();
+    let bundle = Bundle::parse(&bytes).unwrap();
+    alike(&net, TractEngine::from_bundle(&bundle).unwrap(), tracker);
+    alike(&net, NativeEngine::from_bundle(&bundle).unwrap(), tracker);
+}
+
+fn alike(net: &TrackerNet, engine: impl Engine, tracker: TrackerParams) {
+    let name = engine.name();
 
     let mut wide = vec![0; WIDE * HEIGHT * 3];
     probe::recipe_image(7, WIDE, HEIGHT, &mut wide);
-    let mut a = Tracker::new(BurnEngine::new(&net), tracker).unwrap();
-    let mut b = Tracker::new(tract, tracker).unwrap();
+    let mut a = Tracker::new(BurnEngine::new(net), tracker).unwrap();
+    let mut b = Tracker::new(engine, tracker).unwrap();
     let mut worst = 0f32;
     for t in 0..8 {
         let data = picture(&wide, t);
@@ -76,5 +86,5 @@ fn burn_and_tract_drive_the_tracker_alike() {
         assert!(ta.bbox.iou(&tb.bbox) > 0.999, "frame {t}: {ta:?} {tb:?}");
         assert_eq!((ta.flag, ta.wrote_memory), (tb.flag, tb.wrote_memory), "frame {t}");
     }
-    println!("burn against tract through the tracker: scores differ by at most {worst:e}");
+    println!("burn against {name} through the tracker: scores differ by at most {worst:e}");
 }

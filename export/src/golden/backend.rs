@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `burn` | every intermediate, in the form the reference is written in ([`Written`]) |
 //! | `burn, re-arranged` | the inference functions that are exported ([`Arranged`]) |
-//! | `tract`, `ort` | score maps and boxes through the runtime's engine on the bundle's own graphs; features, filters and encoder output from graphs with more outputs ([`OnEngine`]) |
+//! | `native`, `tract`, `ort` | score maps and boxes through the runtime's engine on the bundle's own graphs; features, filters and encoder output from graphs with more outputs ([`OnEngine`]) |
 //!
 //! Another engine of the runtime joins with one line in [`EngineKind::open`] and one in
 //! [`EngineKind::ALL`].

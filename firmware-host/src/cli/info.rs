@@ -29,6 +29,9 @@ pub(super) fn run(args: &InfoArgs) -> Result<u8, HostError> {
         })?;
         println!("\nengine\n  {about}\n  {:<10} {loading:>9.1} ms", "loading");
         print!("{}", stage_table(path, &mut engine, "  ")?);
+        if let AnyEngine::Native(native) = &engine {
+            print!("\n{}", native.plan_summary());
+        }
     }
     Ok(EXIT_OK)
 }

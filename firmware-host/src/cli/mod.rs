@@ -190,7 +190,7 @@ pub struct EvalArgs {
     /// Sequences tracked at a time
     #[arg(long, default_value_t = 1)]
     pub threads: usize,
-    /// Where the network runs: tract, ort, ort:cuda or ort:tensorrt, with options after commas such
+    /// Where the network runs: native, tract, ort, ort:cuda or ort:tensorrt, with options after commas such
     /// as ort,threads=2 (docs/engines.md)
     #[arg(long, value_name = "ENGINE", default_value_t)]
     pub engine: EngineChoice,

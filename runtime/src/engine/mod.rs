@@ -32,7 +32,7 @@ pub trait Engine {
     /// The network's shape.
     fn spec(&self) -> &ModelSpec;
 
-    /// Short name for logs and reports: `tract`, `ort`, `ort:cuda`, `native`, `burn`.
+    /// Short name for logs and reports: `native`, `tract`, `ort`, `ort:cuda`, `burn`.
     fn name(&self) -> &'static str;
 
     /// Input of the `features` graph: `(3, S, S)`, channels R, G, B, normalised
