@@ -134,7 +134,11 @@ impl Tile {
     };
 }
 
-/// `R` rows times `NV` vectors of columns, kept in registers over all of the sum.
+/// Terms that are summed before the sum goes to a total of such sums: rounding errors grow with the
+/// number of terms, and the deepest convolutions have 9,216.
+const CHUNK: usize = 256;
+
+/// `R` rows times `NV` vectors of columns, kept in registers over a chunk of the sum.
 ///
 /// # Safety
 /// The instruction set is there; all pointers of the tile are valid for its sizes; `columns` is
@@ -144,6 +148,10 @@ pub unsafe fn tile<S: Simd, const R: usize, const NV: usize>(t: &Tile) {
     // SAFETY: as promised by the caller.
     unsafe {
         let mut acc = [[S::splat(0.0); NV]; R];
+        let mut total = core::mem::MaybeUninit::<[[[f32; MAX_LANES]; NV]; R]>::uninit();
+        let total: *mut f32 = total.as_mut_ptr().cast();
+        let place = |r: usize, j: usize| total.add((r * NV + j) * MAX_LANES);
+        let (mut folded, mut summed) = (false, 0);
         let mut b = t.b;
         for tap in 0..t.tap_count {
             let offset = *t.taps.add(tap);
@@ -151,17 +159,42 @@ pub unsafe fn tile<S: Simd, const R: usize, const NV: usize>(t: &Tile) {
             for r in 0..R {
                 a[r] = t.a[r].add(offset);
             }
-            for k in 0..t.run {
-                let mut weights = [S::splat(0.0); NV];
-                for j in 0..NV {
-                    weights[j] = S::load(b.add(j * S::LANES));
-                }
-                b = b.add(NV * S::LANES);
-                for r in 0..R {
-                    let x = S::splat(*a[r].add(k));
-                    for j in 0..NV {
-                        acc[r][j] = S::fma(x, weights[j], acc[r][j]);
+            let mut from = 0;
+            while from < t.run {
+                if summed >= CHUNK {
+                    for r in 0..R {
+                        for j in 0..NV {
+                            if folded {
+                                acc[r][j] = S::add(acc[r][j], S::load(place(r, j)));
+                            }
+                            S::store(place(r, j), acc[r][j]);
+                            acc[r][j] = S::splat(0.0);
+                        }
                     }
+                    (folded, summed) = (true, 0);
+                }
+                let to = t.run.min(from + CHUNK);
+                for k in from..to {
+                    let mut weights = [S::splat(0.0); NV];
+                    for j in 0..NV {
+                        weights[j] = S::load(b.add(j * S::LANES));
+                    }
+                    b = b.add(NV * S::LANES);
+                    for r in 0..R {
+                        let x = S::splat(*a[r].add(k));
+                        for j in 0..NV {
+                            acc[r][j] = S::fma(x, weights[j], acc[r][j]);
+                        }
+                    }
+                }
+                summed += to - from;
+                from = to;
+            }
+        }
+        if folded {
+            for r in 0..R {
+                for j in 0..NV {
+                    acc[r][j] = S::add(acc[r][j], S::load(place(r, j)));
                 }
             }
         }
