@@ -7,6 +7,7 @@
 //!
 //! The command line is `tsda-train` (`src/main.rs`).
 
+pub mod align_report;
 pub mod burn_engine;
 pub mod checkpoint;
 pub mod config;

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use tsda_trainer::align_report::{self, AlignOptions, WeightsFrom};
 use tsda_trainer::config::Experiment;
 use tsda_trainer::fit::{self, FitOptions, Outcome};
 use tsda_trainer::import::{self, ImportKind, ImportOptions};
@@ -28,6 +29,8 @@ enum Command {
     WeightsImport(ImportArgs),
     /// Draw training samples as the network sees them.
     SampleSheet(SheetArgs),
+    /// Measure how well the descriptors of both sensors agree. See docs/alignment.md.
+    AlignReport(AlignArgs),
 }
 
 #[derive(clap::Args)]
@@ -108,11 +111,44 @@ struct SheetArgs {
     first: u64,
 }
 
+#[derive(clap::Args)]
+struct AlignArgs {
+    /// The experiment (TOML); network, sampler and processing are taken from it.
+    #[arg(long)]
+    config: PathBuf,
+    /// Weights of the whole network (safetensors or PyTorch). Without this and --checkpoint: what
+    /// training by the configuration starts from.
+    #[arg(long, conflicts_with = "checkpoint")]
+    weights: Option<PathBuf>,
+    /// Folder of a run or of one checkpoint.
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
+    /// Registered pairs, KIND:PATH[@split], for example pairs:DIR@val.
+    #[arg(long)]
+    data: String,
+    /// Folder for align.json, align.html and the pictures.
+    #[arg(long)]
+    out: PathBuf,
+    /// Targets to draw.
+    #[arg(long, default_value_t = 200)]
+    pairs: usize,
+    /// Seed of the drawing.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Targets put through the network at a time.
+    #[arg(long, default_value_t = 8)]
+    batch: usize,
+    /// Where to compute.
+    #[arg(long, value_enum, default_value_t = DeviceName::Flex)]
+    device: DeviceName,
+}
+
 fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Fit(args) => run_fit(&args),
         Command::WeightsImport(args) => run_import(&args),
         Command::SampleSheet(args) => run_sheet(&args),
+        Command::AlignReport(args) => run_align(args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -229,5 +265,31 @@ fn run_sheet(args: &SheetArgs) -> Result<()> {
     for (row, sample) in samples.iter().enumerate() {
         println!("row {row}: {}", sample.id);
     }
+    Ok(())
+}
+
+fn run_align(args: AlignArgs) -> Result<()> {
+    let experiment = Experiment::load(&args.config)?;
+    let weights = match (args.weights, args.checkpoint) {
+        (Some(file), _) => WeightsFrom::File(file),
+        (None, Some(folder)) => WeightsFrom::Run(folder),
+        (None, None) => WeightsFrom::Initial,
+    };
+    let options = AlignOptions {
+        weights,
+        data: args.data,
+        pairs: args.pairs,
+        seed: args.seed,
+        batch: args.batch,
+        device: device(args.device)?,
+    };
+    let bar = indicatif::ProgressBar::new(args.pairs as u64);
+    let found = align_report::run(&experiment, &options, |done| bar.set_position(done as u64))?;
+    bar.finish_and_clear();
+    found.write(&args.out)?;
+    let report = &found.report;
+    println!("{}: {} targets of {} pairs", report.weights, report.targets, report.sequences);
+    print!("{}", align_report::page::table(report));
+    println!("written: {}", args.out.join("align.html").display());
     Ok(())
 }

@@ -293,6 +293,12 @@ impl Head {
         self.decode(memory, position)
     }
 
+    /// The encoder's outputs `(B, frames * F*F, d)` for tokens of that shape, the search frame last.
+    pub fn encode(&self, tokens: Tensor<3>, side: usize) -> Tensor<3> {
+        let position = position(side, &tokens);
+        self.filter_predictor.transformer.encode(tokens, position)
+    }
+
     fn decode(&self, memory: Tensor<3>, position: Tensor<3>) -> (Tensor<2>, Tensor<3>) {
         let ([_, l, _], cells) = (memory.dims(), position.dims()[1]);
         let predictor = &self.filter_predictor;

@@ -38,6 +38,7 @@ pub mod inspect;
 mod kernels;
 mod layers;
 mod names;
+mod pooled;
 mod resnet;
 #[cfg(test)]
 pub(crate) mod tests;

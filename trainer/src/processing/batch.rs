@@ -35,7 +35,8 @@ pub struct Batch {
 }
 
 impl Batch {
-    fn new(spec: &ModelSpec, samples: &[Sample]) -> Self {
+    /// Puts samples of equally many templates together.
+    pub(crate) fn new(spec: &ModelSpec, samples: &[Sample]) -> Self {
         let templates = samples.first().map_or(0, |s| s.templates.len());
         let mut batch = Self {
             size: samples.len(),
