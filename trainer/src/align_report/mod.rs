@@ -326,9 +326,9 @@ fn network(
         WeightsFrom::Initial => {
             let (backbone, whole) = (&experiment.init.backbone, &experiment.init.weights);
             let words = if whole.is_empty() {
-                format!("untrained (init.backbone = {backbone})")
+                format!("start of training (init.backbone = {backbone}, random head)")
             } else {
-                format!("untrained (init.weights = {whole})")
+                format!("start of training (init.weights = {whole})")
             };
             return Ok((initial_net(experiment, &options.device)?, words));
         }

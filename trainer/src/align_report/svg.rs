@@ -17,6 +17,13 @@ const NAMES: [&str; 2] = ["RGB", "thermal"];
 /// Templates and search crops that are drawn together: template sensor, search sensor.
 const PAIRS: [(usize, usize); 2] = [(0, 1), (1, 0)];
 
+/// A descriptor in the plane of the components.
+struct Point {
+    at: (f64, f64),
+    sensor: usize,
+    role: Role,
+}
+
 /// The picture of one stage: targets in both cross-modal directions. `centred` views and their
 /// components.
 pub fn scatter(title: &str, centred: &[Views], pca: &Pca) -> String {
@@ -26,20 +33,20 @@ pub fn scatter(title: &str, centred: &[Views], pca: &Pca) -> String {
         let at = |i: usize| p.get(i).copied().unwrap_or(0.0);
         (at(0), at(1))
     };
-    let pairs: Vec<[((f64, f64), usize, Role); 2]> = shown
+    let point = |views: &Views, role, sensor, partner| Point {
+        at: place(views.at(role, sensor, partner)),
+        sensor,
+        role,
+    };
+    let pairs: Vec<[Point; 2]> = shown
         .iter()
         .flat_map(|t| {
-            PAIRS.map(|(a, b)| {
-                [
-                    (place(t.at(Role::Template, a, b)), a, Role::Template),
-                    (place(t.at(Role::Search, b, a)), b, Role::Search),
-                ]
-            })
+            PAIRS.map(|(a, b)| [point(t, Role::Template, a, b), point(t, Role::Search, b, a)])
         })
         .collect();
     let axes = [
-        Axis::new(pairs.iter().flatten().map(|p| p.0.0), [PLOT[0], PLOT[2]]),
-        Axis::new(pairs.iter().flatten().map(|p| p.0.1), [PLOT[3], PLOT[1]]),
+        Axis::new(pairs.iter().flatten().map(|p| p.at.0), [PLOT[0], PLOT[2]]),
+        Axis::new(pairs.iter().flatten().map(|p| p.at.1), [PLOT[3], PLOT[1]]),
     ];
     let at = |(x, y): (f64, f64)| (axes[0].place(x), axes[1].place(y));
 
@@ -52,20 +59,21 @@ pub fn scatter(title: &str, centred: &[Views], pca: &Pca) -> String {
         PLOT[0]
     );
     frame(&mut svg, &axes, pca);
-    svg.push_str("<g stroke=\"#666\" stroke-width=\"0.7\" stroke-opacity=\"0.45\">\n");
+    svg.push_str("<g stroke=\"#666\" stroke-width=\"0.7\" stroke-opacity=\"0.6\">\n");
     for [a, b] in pairs.iter().take(2 * JOINED) {
-        let ((x1, y1), (x2, y2)) = (at(a.0), at(b.0));
+        let ((x1, y1), (x2, y2)) = (at(a.at), at(b.at));
         put(
             &mut svg,
             format_args!("<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\"/>\n"),
         );
     }
     svg.push_str("</g>\n");
-    for (point, sensor, role) in pairs.iter().flatten() {
-        marker(&mut svg, at(*point), *sensor, *role, 4.0);
+    for point in pairs.iter().flatten() {
+        marker(&mut svg, at(point.at), point.sensor, point.role, 4.0);
     }
     for sensor in 0..2 {
-        let of: Vec<_> = pairs.iter().flatten().filter(|p| p.1 == sensor).map(|p| p.0).collect();
+        let of: Vec<_> =
+            pairs.iter().flatten().filter(|p| p.sensor == sensor).map(|p| p.at).collect();
         let n = of.len().max(1) as f64;
         let centre = of.iter().fold((0.0, 0.0), |s, p| (s.0 + p.0 / n, s.1 + p.1 / n));
         centroid(&mut svg, at(centre), sensor);

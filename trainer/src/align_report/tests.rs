@@ -295,7 +295,7 @@ fn bad_input_is_named() {
     for (text, wanted) in [
         ("nothing", "expected KIND:PATH"),
         (&data.replace("pairs:", "pseudo:"), "registered pairs"),
-        (&data.replace("@val", "@train"), "registered pairs"),
+        (&data.replace("@val", "@train"), "split 'train'"),
     ] {
         bench.options.data = text.into();
         assert!(bench.message().contains(wanted), "{text}: {}", bench.message());
