@@ -170,6 +170,10 @@ pub struct VerifyArgs {
 /// Arguments of `tsda eval`.
 #[cfg(feature = "eval")]
 #[derive(Debug, Args)]
+#[command(after_help = "\
+Exit codes: 0 done, 1 done but sequences failed (listed in summary.json), 2 the input cannot be used, 3 \
+interrupted, or nothing could be tracked. Finished sequences are kept in any case; the same command \
+goes on with the others.")]
 pub struct EvalArgs {
     /// Bundle to evaluate, instead of the embedded one
     #[arg(long, value_name = "FILE.tsda")]
@@ -178,18 +182,30 @@ pub struct EvalArgs {
     /// pseudo:PATH[@split] for clips made from registered stills
     #[arg(long, value_name = "KIND:PATH[@SPLIT]")]
     pub dataset: String,
-    /// rgb2t, t2rgb, switch:N, rgb or t; may be repeated [default: rgb2t t2rgb switch:20]
+    /// rgb2t, t2rgb, switch:N, rgb or t; may be repeated [default: rgb2t t2rgb switch:20; on data of
+    /// one sensor rgb or t]
     #[arg(long, value_name = "PROTOCOL")]
     pub protocol: Vec<tsda_eval::protocol::Protocol>,
-    /// Folder for summary.json, summary.md and the boxes, made if needed
+    /// Folder for summary.json, summary.md, report.json and the results, made if needed. Sequences
+    /// finished by an earlier run with the same bundle, dataset and engine are taken up
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Throw away what an earlier run left for these trackers and protocols
+    #[arg(long)]
+    pub fresh: bool,
     /// Also run a static box and template matching
     #[arg(long)]
     pub baselines: bool,
-    /// Sequences tracked at a time
-    #[arg(long, default_value_t = 1)]
-    pub threads: usize,
+    /// Sequences tracked at a time; figures do not depend on it, frame rates do
+    #[arg(long, value_name = "N", visible_alias = "threads", default_value_t = 1)]
+    pub jobs: usize,
+    /// Rules of report.json and of the tables: tsda, lasher, rgbt234, rgbt210, gtot, otb or got10k
+    /// [default: those of the dataset's benchmark, else tsda]
+    #[arg(long, value_name = "NAME")]
+    pub convention: Option<tsda_eval::metrics::Convention>,
+    /// Frames in a row on the target that make a recovery after a sensor switch
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
+    pub hold: u32,
     /// Where the network runs: native, tract, ort, ort:cuda or ort:tensorrt, with options after commas such
     /// as ort,threads=2 (docs/engines.md)
     #[arg(long, value_name = "ENGINE", default_value_t)]

@@ -64,6 +64,11 @@ impl BundleFile {
             .map_err(|source| BundleFileError::Bundle { path: self.path.clone(), source })
     }
 
+    /// All of it, as it stands in the file.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
     /// Where it was read from.
     pub fn path(&self) -> &Path {
         &self.path

@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use crate::boxes::read_text;
-use crate::dataset::DatasetError;
+use crate::dataset::{Dataset, DatasetError};
 use crate::truth::read_names;
 
 /// LasHeR's attributes in the order of its files.
@@ -36,6 +36,17 @@ impl Attributes {
     /// Gives a sequence an attribute.
     pub fn insert(&mut self, sequence: &str, attribute: &str) {
         self.0.entry(sequence.to_owned()).or_default().insert(attribute.to_owned());
+    }
+
+    /// Those the loader of a dataset found.
+    pub fn of_dataset(dataset: &Dataset) -> Self {
+        let mut attributes = Self::default();
+        for sequence in &dataset.sequences {
+            for attribute in sequence.attributes() {
+                attributes.insert(sequence.id(), attribute);
+            }
+        }
+        attributes
     }
 
     /// Nothing known.

@@ -16,6 +16,10 @@ impl TrackerUnderTest for StaticBox {
         "static box"
     }
 
+    fn timed(&self) -> bool {
+        false
+    }
+
     fn init(&mut self, _: &Picture, bbox: BBox, _: Modality) -> Result<(), TrackerError> {
         self.bbox = Some(bbox);
         Ok(())

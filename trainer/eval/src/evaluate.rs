@@ -1,13 +1,25 @@
 //! Running one tracker over a whole dataset, several sequences at a time.
+//!
+//! [`evaluate()`] keeps everything in memory and gives up at the first failure. [`evaluate_all`]
+//! goes on past failures, lists them, keeps finished sequences in a [`ResultStore`] and takes up
+//! those of an earlier run.
 
+use std::any::Any;
+use std::ops::ControlFlow;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-use crate::dataset::{Dataset, Sequence};
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::{Dataset, DatasetError, Sequence};
 use crate::metrics::{FirstFrame, Scores};
 use crate::protocol::{
-    EvalError, Protocol, SequenceResult, TrackerError, TrackerUnderTest, run, start_frame,
+    EvalError, Protocol, SequenceResult, TrackerError, TrackerUnderTest, label, run_watched,
+    start_frame,
 };
+use crate::store::ResultStore;
 
 /// How to evaluate.
 #[derive(Clone, Copy, Debug)]
@@ -38,6 +50,90 @@ pub struct Progress<'a> {
     pub scores: Scores,
 }
 
+/// Looks on while [`evaluate_all`] works; called from several threads.
+pub trait Observer: Sync {
+    /// Before anything is tracked: targets and frames in all, and how many of them are there from
+    /// an earlier run.
+    fn planned(&self, _all: Extent, _kept: Extent) {}
+    /// After every frame.
+    fn frame(&self) {}
+    /// After every finished target, those of an earlier run left out.
+    fn finished(&self, _progress: Progress<'_>) {}
+    /// After every target that failed.
+    fn failed(&self, _failure: &Failure) {}
+    /// Asked after every frame: is the work to end?
+    fn stop(&self) -> bool {
+        false
+    }
+}
+
+/// An amount of work.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Extent {
+    /// Targets.
+    pub targets: usize,
+    /// Frames.
+    pub frames: usize,
+}
+
+/// A target that could not be tracked to its end.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failure {
+    /// The sequence, or `sequence#target`; empty when it could not even be opened.
+    pub sequence: String,
+    /// Frame of the sequence, 0-based, where one can be named.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame: Option<usize>,
+    /// File at fault.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub path: Option<PathBuf>,
+    /// 1-based line of that file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub line: Option<usize>,
+    /// The whole message.
+    pub reason: String,
+}
+
+impl Failure {
+    fn of(label: String, error: &EvalError) -> Self {
+        let failure = match error {
+            EvalError::Frame { frame, source, .. } => {
+                Self { frame: Some(*frame), ..Self::of_dataset(source) }
+            }
+            EvalError::Tracker { frame, .. } => Self { frame: Some(*frame), ..Self::default() },
+            _ => Self::default(),
+        };
+        Self { sequence: label, reason: error.to_string(), ..failure }
+    }
+
+    /// Of a sequence that could not be opened.
+    pub fn of_dataset(error: &DatasetError) -> Self {
+        let (path, line) = match error {
+            DatasetError::Io { path, .. } | DatasetError::Picture { path, .. } => {
+                (Some(path), None)
+            }
+            DatasetError::Format { path, line, .. } => (Some(path), *line),
+            _ => (None, None),
+        };
+        Self { path: path.cloned(), line, reason: error.to_string(), ..Self::default() }
+    }
+}
+
+impl Default for Failure {
+    fn default() -> Self {
+        Self { sequence: String::new(), frame: None, path: None, line: None, reason: String::new() }
+    }
+}
+
+/// A sequence or target that a protocol cannot run on.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Skipped {
+    /// The sequence, or `sequence#target`.
+    pub sequence: String,
+    /// Why.
+    pub reason: String,
+}
+
 /// Results of one tracker under one protocol.
 #[derive(Clone, Debug)]
 pub struct Evaluation {
@@ -53,12 +149,68 @@ pub struct Evaluation {
     pub results: Vec<SequenceResult>,
     /// Figures of `results`.
     pub scores: Vec<Scores>,
-    /// Sequences left out: they lack a sensor of the protocol or have no target.
-    pub skipped: Vec<String>,
+    /// Left out: they lack a sensor of the protocol or have no target.
+    pub skipped: Vec<Skipped>,
+    /// Tried and failed, in the order of the dataset.
+    pub failed: Vec<Failure>,
 }
 
-/// Where a thread leaves what became of one target.
-type Slot = Mutex<Option<Result<(SequenceResult, Scores), EvalError>>>;
+impl Evaluation {
+    /// Takes the targets with these [labels](SequenceResult::label) out of results and scores.
+    pub fn leave_out(&mut self, labels: &std::collections::BTreeSet<String>) {
+        let keep: Vec<bool> = self.results.iter().map(|r| !labels.contains(&r.label())).collect();
+        let mut flags = keep.iter();
+        self.results.retain(|_| flags.next().copied().unwrap_or(true));
+        let mut flags = keep.iter();
+        self.scores.retain(|_| flags.next().copied().unwrap_or(true));
+    }
+}
+
+/// One target to track.
+struct Job<'a> {
+    sequence: &'a dyn Sequence,
+    target: usize,
+    frames: usize,
+}
+
+/// What `protocol` can run on, in the order of the dataset, and what it cannot.
+fn jobs(dataset: &Dataset, protocol: Protocol) -> (Vec<Job<'_>>, Vec<Skipped>) {
+    let (mut jobs, mut skipped) = (Vec::new(), Vec::new());
+    for sequence in &dataset.sequences {
+        let sequence = sequence.as_ref();
+        let mut skip = |sequence: String, reason| skipped.push(Skipped { sequence, reason });
+        let lacks = protocol.needs().iter().find(|m| !sequence.modalities().contains(m));
+        if let Some(modality) = lacks {
+            skip(sequence.id().to_owned(), format!("no {modality} frames"));
+        } else if sequence.frames() == 0 {
+            skip(sequence.id().to_owned(), "no frames".into());
+        } else if sequence.targets() == 0 {
+            skip(sequence.id().to_owned(), "no boxes".into());
+        } else {
+            for target in 0..sequence.targets() {
+                match start_frame(sequence, target, protocol) {
+                    Some(start) => {
+                        let frames = sequence.frames() - start;
+                        jobs.push(Job { sequence, target, frames });
+                    }
+                    None => {
+                        let reason = format!("no {} box to start from", protocol.modality(0));
+                        skip(label(sequence.id(), target), reason);
+                    }
+                }
+            }
+        }
+    }
+    (jobs, skipped)
+}
+
+/// Is there anything in the dataset that `protocol` can run on?
+pub fn can_run(dataset: &Dataset, protocol: Protocol) -> bool {
+    !jobs(dataset, protocol).0.is_empty()
+}
+
+/// Makes a tracker for one thread.
+pub type MakeTracker<'a> = dyn Fn() -> Result<Box<dyn TrackerUnderTest>, TrackerError> + Sync + 'a;
 
 /// Runs trackers made by `make_tracker` over every target of the dataset that `protocol` can run
 /// on. Each thread makes one tracker and uses it for all its sequences.
@@ -69,113 +221,218 @@ type Slot = Mutex<Option<Result<(SequenceResult, Scores), EvalError>>>;
 pub fn evaluate(
     dataset: &Dataset,
     protocol: Protocol,
-    make_tracker: &(dyn Fn() -> Result<Box<dyn TrackerUnderTest>, TrackerError> + Sync),
+    make_tracker: &MakeTracker<'_>,
     options: Options,
     progress: &(dyn Fn(Progress<'_>) + Sync),
 ) -> Result<Evaluation, EvalError> {
-    let mut skipped = Vec::new();
-    let mut jobs: Vec<(&dyn Sequence, usize)> = Vec::new();
-    for sequence in &dataset.sequences {
-        let sequence = sequence.as_ref();
-        let before = jobs.len();
-        if protocol.needs().iter().all(|m| sequence.modalities().contains(m)) {
-            let targets = 0..sequence.targets();
-            jobs.extend(
-                targets
-                    .filter(|&t| start_frame(sequence, t, protocol).is_some())
-                    .map(|t| (sequence, t)),
-            );
+    struct Tell<'a>(&'a (dyn Fn(Progress<'_>) + Sync), AtomicBool);
+    impl Observer for Tell<'_> {
+        fn finished(&self, progress: Progress<'_>) {
+            (self.0)(progress);
         }
-        if jobs.len() == before {
-            skipped.push(sequence.id().to_owned());
+        fn failed(&self, _: &Failure) {
+            self.1.store(true, Ordering::Relaxed);
+        }
+        fn stop(&self) -> bool {
+            self.1.load(Ordering::Relaxed)
         }
     }
+    let observer = Tell(progress, AtomicBool::new(false));
+    let outcome = work(dataset, protocol, make_tracker, options, None, &observer)?;
+    match outcome.first_error {
+        Some(e) => Err(e),
+        None => Ok(outcome.evaluation),
+    }
+}
+
+/// As [`evaluate()`], but a target that fails is listed and the others go on; finished ones are
+/// kept in `store`, and those that are in it already are not tracked again.
+///
+/// # Errors
+/// When nothing can be run at all, no tracker can be made, a result cannot be kept, or the
+/// observer asked to stop. What is finished by then stays in the store.
+pub fn evaluate_all(
+    dataset: &Dataset,
+    protocol: Protocol,
+    make_tracker: &MakeTracker<'_>,
+    options: Options,
+    store: Option<&ResultStore>,
+    observer: &dyn Observer,
+) -> Result<Evaluation, EvalError> {
+    let outcome = work(dataset, protocol, make_tracker, options, store, observer)?;
+    if outcome.finished < outcome.total && observer.stop() {
+        let (finished, total) = (outcome.evaluation.results.len(), outcome.total);
+        return Err(EvalError::Interrupted { protocol, finished, total });
+    }
+    Ok(outcome.evaluation)
+}
+
+struct Outcome {
+    evaluation: Evaluation,
+    /// Targets that came to an end, be it a failure.
+    finished: usize,
+    total: usize,
+    first_error: Option<EvalError>,
+}
+
+/// Where a thread leaves what became of one target.
+type Slot = Mutex<Option<Result<(SequenceResult, Scores), EvalError>>>;
+
+fn work(
+    dataset: &Dataset,
+    protocol: Protocol,
+    make_tracker: &MakeTracker<'_>,
+    options: Options,
+    store: Option<&ResultStore>,
+    observer: &dyn Observer,
+) -> Result<Outcome, EvalError> {
+    let (jobs, skipped) = jobs(dataset, protocol);
     if jobs.is_empty() {
         return Err(EvalError::Empty { dataset: dataset.name.clone(), protocol });
     }
+    let total = jobs.len();
+    let slots: Vec<Slot> = jobs.iter().map(|_| Mutex::new(None)).collect();
+    let mut open = Vec::with_capacity(total);
+    let mut kept = Extent::default();
+    for (i, job) in jobs.iter().enumerate() {
+        match store.and_then(|s| s.load(job.sequence, job.target, protocol)) {
+            Some(result) => {
+                kept.targets += 1;
+                kept.frames += job.frames;
+                put(&slots[i], scored(result, options.first_frame));
+            }
+            None => open.push(i),
+        }
+    }
+    let frames = jobs.iter().map(|j| j.frames).sum();
+    observer.planned(Extent { targets: total, frames }, kept);
 
     let next = AtomicUsize::new(0);
-    let done = AtomicUsize::new(0);
-    let stop = AtomicBool::new(false);
-    let name = Mutex::new(None);
-    let slots: Vec<Slot> = jobs.iter().map(|_| Mutex::new(None)).collect();
-    let work = || {
-        let mut tracker = match make_tracker() {
-            Ok(tracker) => tracker,
-            Err(e) => {
-                stop.store(true, Ordering::Relaxed);
-                return Some(EvalError::MakeTracker(e));
-            }
-        };
-        if let Ok(mut name) = name.lock() {
-            *name = Some(tracker.name().to_owned());
-        }
-        while !stop.load(Ordering::Relaxed) {
-            let i = next.fetch_add(1, Ordering::Relaxed);
-            let Some(&(sequence, target)) = jobs.get(i) else { break };
-            let outcome = one(sequence, target, protocol, tracker.as_mut(), options.first_frame);
+    let done = AtomicUsize::new(kept.targets);
+    // Something none of the threads can get past.
+    let fatal: Mutex<Option<EvalError>> = Mutex::new(None);
+    let dead = AtomicBool::new(false);
+    let give_up = |e: EvalError| {
+        dead.store(true, Ordering::Relaxed);
+        fatal.lock().unwrap_or_else(|p| p.into_inner()).get_or_insert(e);
+    };
+    let name = Mutex::new(store.map(|s| s.manifest().tracker.clone()));
+    let stopped = || dead.load(Ordering::Relaxed) || observer.stop();
+    let worker = || {
+        let mut spare: Option<Box<dyn TrackerUnderTest>> = None;
+        while !stopped() {
+            let Some(&i) = open.get(next.fetch_add(1, Ordering::Relaxed)) else { break };
+            let mut tracker = match spare.take().map_or_else(make_tracker, Ok) {
+                Ok(tracker) => tracker,
+                Err(e) => return give_up(EvalError::MakeTracker(e)),
+            };
+            name.lock()
+                .unwrap_or_else(|p| p.into_inner())
+                .get_or_insert_with(|| tracker.name().to_owned());
+            let watch = || {
+                observer.frame();
+                if stopped() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            };
+            let job = &jobs[i];
+            // The tracker is thrown away after a panic, and nothing else is half changed by one.
+            let run = catch_unwind(AssertUnwindSafe(|| {
+                run_watched(job.sequence, job.target, protocol, tracker.as_mut(), watch)
+            }));
+            let outcome = match run {
+                Ok(Ok(Some(result))) => {
+                    spare = Some(tracker);
+                    scored(result, options.first_frame)
+                }
+                Ok(Ok(None)) => return,
+                Ok(Err(e)) => {
+                    spare = Some(tracker);
+                    Err(e)
+                }
+                Err(panic) => Err(EvalError::Panicked {
+                    sequence: job.sequence.id().to_owned(),
+                    message: panic_message(panic.as_ref()),
+                }),
+            };
             match &outcome {
                 Ok((result, scores)) => {
+                    if let Some(Err(e)) = store.map(|s| s.save(result)) {
+                        return give_up(e.into());
+                    }
                     let done = done.fetch_add(1, Ordering::Relaxed) + 1;
-                    progress(Progress { done, total: jobs.len(), result, scores: *scores });
+                    observer.finished(Progress { done, total, result, scores: *scores });
                 }
-                Err(_) => stop.store(true, Ordering::Relaxed),
+                Err(e) => {
+                    observer.failed(&Failure::of(label(job.sequence.id(), job.target), e));
+                }
             }
-            if let Ok(mut slot) = slots[i].lock() {
-                *slot = Some(outcome);
-            }
+            put(&slots[i], outcome);
         }
-        None
     };
-    let threads = options.threads.clamp(1, jobs.len());
-    let unmade = std::thread::scope(|scope| {
-        let others: Vec<_> = (1..threads).map(|_| scope.spawn(work)).collect();
-        let mut unmade = work();
+    std::thread::scope(|scope| {
+        let threads = options.threads.clamp(1, open.len().max(1));
+        let others: Vec<_> = (1..threads).map(|_| scope.spawn(worker)).collect();
+        worker();
         for other in others {
-            match other.join() {
-                Ok(e) => unmade = unmade.take().or(e),
-                // A panic in a tracker is a bug there: let it come through with its message.
-                Err(panic) => std::panic::resume_unwind(panic),
+            if let Err(panic) = other.join() {
+                // Only an observer's own panic gets here.
+                std::panic::resume_unwind(panic);
             }
         }
-        unmade
     });
-    if let Some(e) = unmade {
+    if let Some(e) = fatal.into_inner().unwrap_or_else(|p| p.into_inner()) {
         return Err(e);
     }
 
-    let mut results = Vec::with_capacity(jobs.len());
-    let mut scores = Vec::with_capacity(jobs.len());
-    for slot in slots {
-        // A slot stays empty only behind a failure, which stands in an earlier one or is met later.
-        if let Some(outcome) = slot.into_inner().unwrap_or_else(|p| p.into_inner()) {
-            let (result, score) = outcome?;
-            results.push(result);
-            scores.push(score);
-        }
-    }
-    let tracker = name.into_inner().unwrap_or_else(|p| p.into_inner()).unwrap_or_default();
-    Ok(Evaluation {
-        tracker,
+    let mut evaluation = Evaluation {
+        tracker: name.into_inner().unwrap_or_else(|p| p.into_inner()).unwrap_or_default(),
         dataset: dataset.name.clone(),
         protocol,
         first_frame: options.first_frame,
-        results,
-        scores,
+        results: Vec::with_capacity(total),
+        scores: Vec::with_capacity(total),
         skipped,
-    })
+        failed: Vec::new(),
+    };
+    let mut first_error = None;
+    for (slot, job) in slots.into_iter().zip(&jobs) {
+        match slot.into_inner().unwrap_or_else(|p| p.into_inner()) {
+            Some(Ok((result, scores))) => {
+                evaluation.results.push(result);
+                evaluation.scores.push(scores);
+            }
+            Some(Err(e)) => {
+                let label = label(job.sequence.id(), job.target);
+                evaluation.failed.push(Failure::of(label, &e));
+                first_error.get_or_insert(e);
+            }
+            // Stopped before its turn.
+            None => {}
+        }
+    }
+    let finished = evaluation.results.len() + evaluation.failed.len();
+    Ok(Outcome { evaluation, finished, total, first_error })
 }
 
-fn one(
-    sequence: &dyn Sequence,
-    target: usize,
-    protocol: Protocol,
-    tracker: &mut dyn TrackerUnderTest,
+fn put(slot: &Slot, outcome: Result<(SequenceResult, Scores), EvalError>) {
+    *slot.lock().unwrap_or_else(|p| p.into_inner()) = Some(outcome);
+}
+
+fn scored(
+    result: SequenceResult,
     first: FirstFrame,
 ) -> Result<(SequenceResult, Scores), EvalError> {
-    let result = run(sequence, target, protocol, tracker)?;
     match result.scores(first) {
         Ok(scores) => Ok((result, scores)),
         Err(source) => Err(EvalError::Length { sequence: result.sequence, source }),
     }
 }
+
+fn panic_message(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().copied();
+    let text = text.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    text.unwrap_or("without a message").to_owned()
+}
+
+#[cfg(test)]
+#[path = "evaluate_tests.rs"]
+mod tests;

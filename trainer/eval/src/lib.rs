@@ -6,7 +6,8 @@
 //! * [`protocol`]: which sensor a frame comes from (`rgb2t`, `t2rgb`, `switch:20`, ..), and
 //!   [`protocol::TrackerUnderTest`], what can be evaluated.
 //! * [`evaluate()`]: a whole dataset, several sequences at a time; the same figures on any number of
-//!   threads.
+//!   threads. [`evaluate_all`] keeps finished sequences in a [`store::ResultStore`], takes up those
+//!   of an earlier run and goes on past failures; [`run_summary`] puts it all into files.
 //! * [`metrics`]: SR@0.5, success AUC, PR@20, normalised precision, mean IoU; the same by the rules of
 //!   each benchmark's toolkit; time to recover after a sensor switch.
 //! * [`truth`], [`results`], [`attributes`], [`compare`]: results of any tracker, read from text,
@@ -46,7 +47,9 @@ pub mod baselines;
 pub mod boxes;
 pub mod compare;
 pub mod dataset;
+pub mod distribution;
 pub mod evaluate;
+pub mod fingerprint;
 pub mod metrics;
 pub mod otb;
 pub mod protocol;
@@ -54,10 +57,12 @@ pub mod pseudo;
 pub mod report_data;
 pub mod results;
 mod rng;
+pub mod run_summary;
 pub mod runtime;
+pub mod store;
 pub mod summary;
 pub mod tables;
 pub mod truth;
 
-pub use evaluate::{Evaluation, Options, Progress, evaluate};
+pub use evaluate::{Evaluation, Options, Progress, evaluate, evaluate_all};
 pub use runtime::RuntimeTracker;

@@ -1,13 +1,15 @@
 //! Which sensor a tracker sees in which frame, and running one over a sequence.
 
 use std::fmt;
+use std::ops::ControlFlow;
 use std::str::FromStr;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use tsda_runtime::{BBox, Modality};
 
 use crate::dataset::{DatasetError, Picture, Sequence};
 use crate::metrics::{self, FirstFrame, LengthMismatch, Scores};
+use crate::store::StoreError;
 
 /// Which sensor each frame comes from, counted from the frame the tracker is initialised with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -101,6 +103,11 @@ pub trait TrackerUnderTest {
     /// Name in reports.
     fn name(&self) -> &str;
 
+    /// Is there work worth timing? A tracker that does not look at the picture has no frame rate.
+    fn timed(&self) -> bool {
+        true
+    }
+
     /// Starts on a frame with the target's box.
     ///
     /// # Errors
@@ -145,8 +152,22 @@ pub struct SequenceResult {
     pub predicted: Vec<BBox>,
     /// Confidence; entry 0 is 1.
     pub confidence: Vec<f32>,
-    /// Time spent inside the tracker, decoding excluded.
-    pub time: Duration,
+    /// Milliseconds inside the tracker by frame, decoding excluded, entry 0 being the start; empty
+    /// for a tracker that is not [timed](TrackerUnderTest::timed).
+    pub milliseconds: Vec<f32>,
+}
+
+/// Milliseconds and number of the frames tracked, those that start a run left out.
+pub fn tracking_time<'a>(results: impl IntoIterator<Item = &'a SequenceResult>) -> (f64, usize) {
+    let frames = results.into_iter().flat_map(|r| r.milliseconds.iter().skip(1));
+    frames.fold((0.0, 0), |(sum, n), ms| (sum + f64::from(*ms), n + 1))
+}
+
+/// Frames per second inside the tracker, those that start a run left out; `None` where nothing was
+/// timed.
+pub fn frame_rate<'a>(results: impl IntoIterator<Item = &'a SequenceResult>) -> Option<f64> {
+    let (milliseconds, frames) = tracking_time(results);
+    (milliseconds > 0.0).then(|| 1e3 * frames as f64 / milliseconds)
 }
 
 impl SequenceResult {
@@ -160,10 +181,15 @@ impl SequenceResult {
 
     /// `sequence`, or `sequence#target` from the second target on: names result files.
     pub fn label(&self) -> String {
-        match self.target {
-            0 => self.sequence.clone(),
-            n => format!("{}#{n}", self.sequence),
-        }
+        label(&self.sequence, self.target)
+    }
+}
+
+/// `sequence`, or `sequence#target` from the second target on.
+pub fn label(sequence: &str, target: usize) -> String {
+    match target {
+        0 => sequence.to_owned(),
+        n => format!("{sequence}#{n}"),
     }
 }
 
@@ -172,8 +198,15 @@ impl SequenceResult {
 #[non_exhaustive]
 pub enum EvalError {
     /// A frame could not be read.
-    #[error(transparent)]
-    Dataset(#[from] DatasetError),
+    #[error("sequence {sequence}, frame {frame}: {source}")]
+    Frame {
+        /// The sequence.
+        sequence: String,
+        /// Frame of the sequence, 0-based.
+        frame: usize,
+        /// What is wrong with the file.
+        source: DatasetError,
+    },
     /// The tracker gave up.
     #[error("{tracker} on sequence {sequence}, frame {frame}: {source}")]
     Tracker {
@@ -185,6 +218,14 @@ pub enum EvalError {
         frame: usize,
         /// What it said.
         source: TrackerError,
+    },
+    /// The tracker, or the decoder of its pictures, panicked: a bug there.
+    #[error("sequence {sequence}: panicked: {message}")]
+    Panicked {
+        /// The sequence.
+        sequence: String,
+        /// The message of the panic.
+        message: String,
     },
     /// No tracker could be made.
     #[error("cannot make a tracker: {0}")]
@@ -217,6 +258,19 @@ pub enum EvalError {
         /// The protocol.
         protocol: Protocol,
     },
+    /// Results could not be kept.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// Stopped on request.
+    #[error("interrupted: {finished} of {total} sequences of protocol {protocol} are finished")]
+    Interrupted {
+        /// The protocol.
+        protocol: Protocol,
+        /// Finished so far.
+        finished: usize,
+        /// In all.
+        total: usize,
+    },
     /// A result of unequal lists.
     #[error("sequence {sequence}: {source}")]
     Length {
@@ -243,6 +297,22 @@ pub fn run(
     protocol: Protocol,
     tracker: &mut dyn TrackerUnderTest,
 ) -> Result<SequenceResult, EvalError> {
+    let whole = run_watched(sequence, target, protocol, tracker, || ControlFlow::Continue(()))?;
+    // Nobody asked to stop.
+    whole.ok_or(EvalError::Interrupted { protocol, finished: 0, total: 1 })
+}
+
+/// As [`run`], asking `watch` after every frame whether to go on; `None` when it was not to.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_watched(
+    sequence: &dyn Sequence,
+    target: usize,
+    protocol: Protocol,
+    tracker: &mut dyn TrackerUnderTest,
+    mut watch: impl FnMut() -> ControlFlow<()>,
+) -> Result<Option<SequenceResult>, EvalError> {
     for &modality in protocol.needs() {
         if !sequence.modalities().contains(&modality) {
             let sequence = sequence.id().to_owned();
@@ -263,16 +333,20 @@ pub fn run(
         modalities.iter().enumerate().map(|(i, &m)| sequence.truth(target, start + i, m)).collect();
     let mut predicted = Vec::with_capacity(frames);
     let mut confidence = Vec::with_capacity(frames);
-    let mut time = Duration::ZERO;
+    let mut milliseconds = Vec::with_capacity(frames);
     for (i, &modality) in modalities.iter().enumerate() {
-        let picture = sequence.picture(start + i, modality)?;
+        let picture = sequence.picture(start + i, modality).map_err(|source| EvalError::Frame {
+            sequence: sequence.id().to_owned(),
+            frame: start + i,
+            source,
+        })?;
         let clock = Instant::now();
         let answer = if i == 0 {
             tracker.init(&picture, first_box, modality).map(|()| (first_box, 1.0))
         } else {
             tracker.update(&picture, modality)
         };
-        time += clock.elapsed();
+        milliseconds.push(clock.elapsed().as_secs_f32() * 1e3);
         let (bbox, score) = answer.map_err(|source| EvalError::Tracker {
             tracker: tracker.name().to_owned(),
             sequence: sequence.id().to_owned(),
@@ -281,8 +355,14 @@ pub fn run(
         })?;
         predicted.push(bbox);
         confidence.push(score);
+        if watch().is_break() {
+            return Ok(None);
+        }
     }
-    Ok(SequenceResult {
+    if !tracker.timed() {
+        milliseconds.clear();
+    }
+    Ok(Some(SequenceResult {
         sequence: sequence.id().to_owned(),
         target,
         start,
@@ -290,8 +370,8 @@ pub fn run(
         truth,
         predicted,
         confidence,
-        time,
-    })
+        milliseconds,
+    }))
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use tsda_runtime::Modality;
 
 use crate::attributes::Attributes;
+use crate::distribution::{LatencyHistogram, ScoreHistogram};
 use crate::evaluate::Evaluation;
 use crate::metrics::recovery::{self, DEFAULT_HOLD};
 use crate::metrics::score::row;
@@ -15,6 +16,8 @@ use crate::metrics::{
     Convention, Figures, Recovery, Row, Score, ScoreError, ScoreOptions, SwitchRecovery, Truth,
     frame_errors, score,
 };
+use crate::protocol::frame_rate;
+use crate::truth::TruthSet;
 
 /// Version of the layout; raised when a reader of the old one would go wrong.
 pub const REPORT_VERSION: u32 = 1;
@@ -93,6 +96,12 @@ pub struct TrackerData {
     pub overall: Score,
     /// Frames per second inside the tracker, where known.
     pub fps: Option<f64>,
+    /// Confidences, where known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scores: Option<ScoreHistogram>,
+    /// Time per frame, where known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub latencies_ms: Option<LatencyHistogram>,
     /// Per attribute, by name.
     pub attributes: Vec<GroupData>,
     /// Per number of sensor switches, ascending.
@@ -136,6 +145,19 @@ pub struct SequenceData {
     /// asked for ([`DataOptions::frames`]).
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub iou: Vec<Option<f64>>,
+    /// Frame of the sequence that the run started with; entry 0 of every list is of this frame.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub start: usize,
+    /// Frames per second inside the tracker, where known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fps: Option<f64>,
+    /// Mean confidence of predicted frames, where known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mean_score: Option<f64>,
+    /// File with boxes, scores and times of every frame ([`crate::store::Record`]), relative to the
+    /// report's folder.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub record: Option<String>,
     /// Predicted boxes that are not finite.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub nan: usize,
@@ -265,6 +287,8 @@ impl TrackerData {
             tracker: tracker.to_owned(),
             overall: Score::average(options.convention, sequences.values().map(|s| &s.score)),
             fps: None,
+            scores: None,
+            latencies_ms: None,
             attributes: by_attribute.iter().map(|(n, m)| group((*n).to_owned(), m)).collect(),
             switches: by_switches.iter().map(|(n, m)| group(switch_group(*n).1, m)).collect(),
             recovery: Recovery::of(sequences.values().flat_map(|s| &s.recoveries), options.hold),
@@ -290,12 +314,62 @@ impl TrackerData {
             let data = SequenceData::of(Truth::one(&truth), &predicted, sensors, options)?;
             sequences.insert(result.label(), data);
         }
-        let seconds: f64 = evaluation.results.iter().map(|r| r.time.as_secs_f64()).sum();
-        let frames: usize = evaluation.results.iter().map(|r| r.predicted.len()).sum();
         let mut data = Self::of(&evaluation.tracker, sequences, attributes, options);
-        data.fps = (seconds > 0.0).then(|| frames as f64 / seconds);
+        data.fps = frame_rate(&evaluation.results);
         Ok(data)
     }
+
+    /// The data of an evaluation against `truth` (of the same dataset, protocol and convention),
+    /// with histograms of scores and times. `record` names a result's file by its label. Results
+    /// without truth in this convention are named in the second list.
+    ///
+    /// # Errors
+    /// When a result does not fit its truth; names the sequence.
+    pub fn of_run(
+        evaluation: &Evaluation,
+        truth: &TruthSet,
+        attributes: &Attributes,
+        options: DataOptions,
+        record: &dyn Fn(&str) -> Option<String>,
+    ) -> Result<(Self, Vec<LeftOut>), EvaluationScoreError> {
+        let by_name: BTreeMap<&str, _> =
+            truth.sequences.iter().map(|s| (s.name.as_str(), s)).collect();
+        let (mut sequences, mut left_out) = (BTreeMap::new(), Vec::new());
+        for result in &evaluation.results {
+            let label = result.label();
+            let Some(truth) = by_name.get(label.as_str()) else {
+                let reason = format!("no truth of convention {}", options.convention);
+                left_out.push(LeftOut { sequence: label, tracker: None, reason });
+                continue;
+            };
+            let predicted: Vec<Row> = result.predicted.iter().map(|p| row(Some(*p))).collect();
+            let sensors = Some(result.modalities.as_slice());
+            let mut data = SequenceData::of(truth.as_truth(), &predicted, sensors, options)
+                .map_err(|source| EvaluationScoreError { sequence: label.clone(), source })?;
+            let scores = result.confidence.iter().skip(1).filter(|s| s.is_finite());
+            let (sum, n) = scores.fold((0.0, 0), |(sum, n), s| (sum + f64::from(*s), n + 1));
+            data.mean_score = (n > 0).then(|| sum / f64::from(n));
+            data.start = result.start;
+            data.fps = frame_rate([result]);
+            data.record = record(&label);
+            sequences.insert(label, data);
+        }
+        let mut data = Self::of(&evaluation.tracker, sequences, attributes, options);
+        data.fps = frame_rate(&evaluation.results);
+        data.scores = ScoreHistogram::of(&evaluation.results);
+        data.latencies_ms = LatencyHistogram::of(&evaluation.results);
+        Ok((data, left_out))
+    }
+}
+
+/// A result that could not be scored.
+#[derive(Debug, thiserror::Error)]
+#[error("sequence {sequence}: {source}")]
+pub struct EvaluationScoreError {
+    /// The sequence.
+    pub sequence: String,
+    /// What does not fit.
+    pub source: ScoreError,
 }
 
 /// Lower end and name of the group that `n` switches belong to: single numbers up to 3, then

@@ -143,7 +143,7 @@ fn an_evaluation_becomes_data() {
         truth: vec![Some(b), None, Some(b), Some(b)],
         predicted: vec![b; 4],
         confidence: vec![1.0; 4],
-        time: std::time::Duration::from_secs(2),
+        milliseconds: vec![9000.0, 500.0, 250.0, 750.0],
     };
     let scores = result.scores(Default::default()).unwrap();
     let evaluation = Evaluation {
@@ -154,6 +154,7 @@ fn an_evaluation_becomes_data() {
         results: vec![result],
         scores: vec![scores],
         skipped: Vec::new(),
+        failed: Vec::new(),
     };
     let data = TrackerData::of_evaluation(&evaluation, &Attributes::default(), options()).unwrap();
     assert_eq!((data.tracker.as_str(), data.fps), ("x", Some(2.0)));
@@ -161,4 +162,28 @@ fn an_evaluation_becomes_data() {
     assert_eq!(data.recovery.map(|r| r.switches), Some(1));
     let two = DataOptions { convention: Convention::Gtot, ..options() };
     assert!(TrackerData::of_evaluation(&evaluation, &Attributes::default(), two).is_err());
+
+    use crate::truth::{SequenceTruth, TruthSet};
+    let visible = vec![T, [0.0; 4], T, T];
+    let one = SequenceTruth { name: "a".into(), visible, ..SequenceTruth::default() };
+    let mut truth = TruthSet { sequences: vec![one], ..TruthSet::default() };
+    let none = Attributes::default();
+    let of_run = |truth: &TruthSet| {
+        let file = |label: &str| Some(format!("x/{label}.json"));
+        TrackerData::of_run(&evaluation, truth, &none, options(), &file)
+    };
+    let (same, left_out) = of_run(&truth).unwrap();
+    assert_eq!((same.overall, same.fps, left_out), (data.overall, data.fps, vec![]));
+    assert_eq!(same.scores.map(|s| (s.on_target[19], s.absent[19])), Some((2, 1)));
+    assert_eq!(same.latencies_ms.map(|l| l.p50), Some(500.0));
+    let a = &same.sequences["a"];
+    assert_eq!(
+        (a.record.as_deref(), a.mean_score, a.fps),
+        (Some("x/a.json"), Some(1.0), Some(2.0))
+    );
+    truth.sequences[0].visible.pop();
+    assert!(of_run(&truth).unwrap_err().to_string().starts_with("sequence a: 4 predicted"));
+    truth.sequences.clear();
+    let (empty, left_out) = of_run(&truth).unwrap();
+    assert_eq!((empty.sequences.len(), left_out[0].sequence.as_str()), (0, "a"));
 }

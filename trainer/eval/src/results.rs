@@ -120,8 +120,7 @@ impl ResultFolder {
     /// The name a sequence has here: its own, or with `_` for characters that file names should not
     /// have, as `tsda eval` writes it (LasHeR has apostrophes and back-quotes).
     fn known_name(&self, prefix: &str, sequence: &str) -> String {
-        let plain =
-            sequence.replace(|c: char| !(c.is_ascii_alphanumeric() || "-_.#".contains(c)), "_");
+        let plain = file_stem(sequence);
         let known = |name: &str| {
             self.stems.contains(&format!("{prefix}{name}")) || self.nested.contains_key(name)
         };
@@ -169,6 +168,13 @@ pub fn read_modalities(path: &Path) -> Result<Vec<Modality>, DatasetError> {
             }),
         })
         .collect()
+}
+
+/// A name as `tsda eval` gives it to files and folders: `_` for everything but letters, digits and
+/// `-_.#`, and before a leading dot.
+pub fn file_stem(name: &str) -> String {
+    let plain = name.replace(|c: char| !(c.is_ascii_alphanumeric() || "-_.#".contains(c)), "_");
+    if plain.starts_with('.') || plain.is_empty() { format!("_{plain}") } else { plain }
 }
 
 fn excerpt(text: &str) -> String {

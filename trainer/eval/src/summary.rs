@@ -3,13 +3,15 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::evaluate::Evaluation;
-use crate::metrics::{FirstFrame, Scores};
+use crate::evaluate::{Evaluation, Failure};
+use crate::metrics::convention::Truths;
+use crate::metrics::{Convention, Figures, FirstFrame, Recovery, Scores};
 use crate::otb;
+use crate::protocol::frame_rate;
+use crate::report_data::{GroupData, LeftOut, TrackerData};
 
 /// Everything a results file says about one tracker on one dataset.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -32,14 +34,62 @@ pub struct ProtocolSummary {
     pub mean: Scores,
     /// Targets that count.
     pub sequences: usize,
-    /// Frames per second inside the tracker, per thread, the initial frame included.
-    pub fps: f64,
+    /// Frames per second inside the tracker, per thread, decoding and the initial frame left out;
+    /// `None` for a tracker without work worth timing.
+    pub fps: Option<f64>,
     /// Every frame counts the same.
     pub pooled: Scores,
     /// By target.
     pub targets: BTreeMap<String, Scores>,
     /// Sequences left out because they lack a sensor or a target.
     pub skipped: Vec<String>,
+    /// Why, and what else is in no average.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub left_out: Vec<LeftOut>,
+    /// Tried and failed.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub failed: Vec<Failure>,
+    /// Figures by the rules of the dataset's benchmark.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub benchmark: Option<BenchmarkFigures>,
+    /// By attribute, by those rules.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub attributes: Vec<GroupData>,
+    /// By number of sensor switches, by those rules.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub switches: Vec<GroupData>,
+    /// After sensor switches.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recovery: Option<Recovery>,
+}
+
+/// Figures by the rules of a benchmark.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BenchmarkFigures {
+    /// Whose rules.
+    pub convention: Convention,
+    /// The figures; `pr5` of GTOT, `ao` and `sr75` of GOT-10k among them.
+    #[serde(flatten)]
+    pub figures: Figures,
+    /// Precision against the better of two truths under its published name: at 20 px, of GTOT 5 px.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mpr: Option<f64>,
+    /// Success against the better of two truths under its published name.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub msr: Option<f64>,
+}
+
+impl BenchmarkFigures {
+    /// Names figures as the papers of a benchmark do.
+    pub fn new(convention: Convention, figures: Figures) -> Self {
+        let two = convention.truths() == Truths::Two;
+        Self {
+            convention,
+            figures,
+            mpr: two.then(|| figures.pr5.unwrap_or(figures.scores.pr20)),
+            msr: two.then_some(figures.scores.auc),
+        }
+    }
 }
 
 /// A summary that cannot be written, read or put together.
@@ -80,13 +130,10 @@ pub enum SummaryError {
 impl ProtocolSummary {
     /// Averages one evaluation.
     pub fn of(evaluation: &Evaluation) -> Self {
-        let time: Duration = evaluation.results.iter().map(|r| r.time).sum();
-        let frames: usize = evaluation.results.iter().map(|r| r.predicted.len()).sum();
-        let seconds = time.as_secs_f64();
         Self {
             mean: Scores::mean(&evaluation.scores),
             sequences: evaluation.scores.iter().filter(|s| s.frames > 0).count(),
-            fps: if seconds > 0.0 { frames as f64 / seconds } else { 0.0 },
+            fps: frame_rate(&evaluation.results),
             pooled: Scores::pooled(&evaluation.scores),
             targets: evaluation
                 .results
@@ -94,8 +141,30 @@ impl ProtocolSummary {
                 .map(crate::protocol::SequenceResult::label)
                 .zip(evaluation.scores.iter().copied())
                 .collect(),
-            skipped: evaluation.skipped.clone(),
+            skipped: evaluation.skipped.iter().map(|s| s.sequence.clone()).collect(),
+            left_out: evaluation
+                .skipped
+                .iter()
+                .map(|s| LeftOut {
+                    sequence: s.sequence.clone(),
+                    tracker: None,
+                    reason: s.reason.clone(),
+                })
+                .collect(),
+            failed: evaluation.failed.clone(),
+            benchmark: None,
+            attributes: Vec::new(),
+            switches: Vec::new(),
+            recovery: None,
         }
+    }
+
+    /// Adds figures, tables and recovery of `data`, scored by the rules of `convention`.
+    pub fn add(&mut self, data: &TrackerData, convention: Convention) {
+        self.benchmark = Some(BenchmarkFigures::new(convention, data.overall.figures));
+        self.attributes = data.attributes.clone();
+        self.switches = data.switches.clone();
+        self.recovery = data.recovery;
     }
 }
 
@@ -193,7 +262,8 @@ pub fn markdown(summaries: &[Summary]) -> String {
                 }
             }
             let (n, frames) = (figures.sequences, figures.mean.frames);
-            let _ = writeln!(text, " {n} | {frames} | {:.0} |", figures.fps);
+            let fps = figures.fps.map_or("-".into(), |fps| format!("{fps:.0}"));
+            let _ = writeln!(text, " {n} | {frames} | {fps} |");
         }
     }
     text
@@ -208,10 +278,19 @@ mod tests {
         let figures = ProtocolSummary {
             mean,
             sequences: 1,
-            fps: 30.25,
+            fps: (tracker != "bad").then_some(30.25),
             pooled: mean,
             targets: BTreeMap::from([("a".to_owned(), mean)]),
             skipped: vec!["b".into()],
+            left_out: Vec::new(),
+            failed: vec![Failure { sequence: "c".into(), frame: Some(3), ..Failure::default() }],
+            benchmark: Some(BenchmarkFigures::new(
+                Convention::Gtot,
+                Figures { scores: mean, pr5: Some(0.125), ..Figures::default() },
+            )),
+            attributes: Vec::new(),
+            switches: Vec::new(),
+            recovery: None,
         };
         Summary {
             tracker: tracker.into(),
@@ -232,6 +311,9 @@ mod tests {
             serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
         assert_eq!(v["protocols"]["rgb2t"]["sr50"], 0.5);
         assert_eq!(v["first_frame"], "excluded");
+        let benchmark = &v["protocols"]["rgb2t"]["benchmark"];
+        assert_eq!((&benchmark["mpr"], &benchmark["msr"]), (&0.125.into(), &0.25.into()));
+        assert_eq!(benchmark["convention"], "gtot");
         std::fs::write(&path, "{}").unwrap();
         assert!(Summary::read_json(&path).unwrap_err().to_string().contains("s.json"));
         assert!(s.write_json(&dir.path().join("no/s.json")).is_err());
@@ -248,6 +330,7 @@ mod tests {
              | 1 | 59 | 30 |"
         );
         assert!(lines[3].contains("| bad | 10.0 | **25.0** |"), "{}", lines[3]);
+        assert!(lines[3].ends_with("| 59 | - |"), "a tracker that is not timed: {}", lines[3]);
         let columns = |l: &str| l.replace("\\|", "").matches('|').count();
         assert!(lines.iter().all(|l| columns(l) == columns(lines[0])));
     }

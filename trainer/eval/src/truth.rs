@@ -169,7 +169,24 @@ fn of_target(
             (boxes(&|_| only), None)
         }
     };
+    let (cover, image) = if convention == Convention::Got10k {
+        let sensor = protocol.map_or(Modality::Rgb, |p| p.modality(0));
+        let sensor = if has(sensor) { sensor } else { Modality::Thermal };
+        let share = |i: usize| {
+            let m = protocol.map_or(sensor, |p| p.modality(i));
+            let seen = f32::from(u8::from(sequence.truth(target, start + i, m).is_some()));
+            // GOT-10k grades in eighths; a row without area is hidden whatever the grade says.
+            let share = sequence.visibility(target, start + i, m).unwrap_or(1.0).min(seen);
+            (share * 8.0).round() as u8
+        };
+        let size = sequence.resolution(sensor).ok().map(|(w, h)| [w as f64, h as f64]);
+        (Some((0..frames).map(share).collect()), size)
+    } else {
+        (None, None)
+    };
     (frames > 0).then(|| SequenceTruth {
+        cover,
+        image,
         visible,
         infrared,
         modalities: protocol.map(|p| (0..frames).map(|i| p.modality(i)).collect()),
