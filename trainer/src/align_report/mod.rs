@@ -44,7 +44,7 @@ const WEIGHTS: &str = "model.safetensors";
 #[non_exhaustive]
 pub enum AlignError {
     /// The data cannot be opened.
-    #[error("--data: {0}")]
+    #[error(transparent)]
     Open(#[from] OpenError),
     /// The data shows no target by both sensors at once.
     #[error(
