@@ -7,6 +7,7 @@ use clap::Args;
 use std::path::{Path, PathBuf};
 use tsda_eval::attributes::Attributes;
 use tsda_eval::compare::{CompareOptions, compare};
+use tsda_eval::dataset::Dataset;
 use tsda_eval::metrics::recovery::DEFAULT_HOLD;
 use tsda_eval::metrics::{Convention, ScoreOptions};
 use tsda_eval::protocol::Protocol;
@@ -66,6 +67,9 @@ pub struct CompareArgs {
     /// Keep the overlap of every frame in comparison.json
     #[arg(long)]
     pub frames: bool,
+    /// Also write the comparison as one self-contained page
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
 }
 
 pub(super) fn run(args: &CompareArgs) -> Result<u8, HostError> {
@@ -73,11 +77,19 @@ pub(super) fn run(args: &CompareArgs) -> Result<u8, HostError> {
         Some(path) => Some(read_names(path).map_err(|e| unusable("--sequences", &e))?),
         None => None,
     };
-    let truth = truth(args, names.as_deref())?;
-    let attributes = match &args.attributes {
-        Some(path) => Attributes::read(path).map_err(|e| unusable("--attributes", &e))?,
-        None => Attributes::default(),
-    };
+    let dataset = args
+        .dataset
+        .as_deref()
+        .map(|text| tsda_eval::dataset::open(text).map_err(|e| unusable("--dataset", &e)))
+        .transpose()?;
+    let truth = truth_of(
+        dataset.as_ref(),
+        args.gt.as_deref(),
+        args.convention,
+        names.as_deref(),
+        args.protocol,
+    )?;
+    let attributes = read_attributes(args.attributes.as_deref())?.unwrap_or_default();
     let mut trackers = Vec::new();
     for text in &args.results {
         let (path, name) = split_name(text);
@@ -92,13 +104,25 @@ pub(super) fn run(args: &CompareArgs) -> Result<u8, HostError> {
             convention: args.convention,
             score: ScoreOptions { round, lengths: args.lengths.into() },
             hold: args.hold as usize,
-            frames: args.frames,
+            // The page judges single frames.
+            frames: args.frames || args.report.is_some(),
         },
         layout: args.pred_layout.of_result(args.convention, round),
         partial: args.partial,
     };
-    let report = compare(&truth, &trackers, &attributes, args.protocol, options)
+    let mut report = compare(&truth, &trackers, &attributes, args.protocol, options)
         .map_err(|e| unusable("--results", &e))?;
+
+    if let Some(page) = &args.report {
+        let data = dataset.as_ref();
+        super::report::of_comparison(
+            page, &report, &trackers, &truth, data, args.protocol, options,
+        )?;
+    }
+    if !args.frames {
+        let trackers = report.protocols.iter_mut().flat_map(|p| &mut p.trackers);
+        trackers.flat_map(|t| t.sequences.values_mut()).for_each(|s| s.iou = Vec::new());
+    }
 
     let table = tables::markdown(&report);
     if let Some(out) = &args.out {
@@ -116,19 +140,31 @@ pub(super) fn run(args: &CompareArgs) -> Result<u8, HostError> {
     Ok(EXIT_OK)
 }
 
-fn truth(args: &CompareArgs, names: Option<&[String]>) -> Result<TruthSet, HostError> {
-    if let Some(folder) = &args.gt {
-        return TruthSet::read_folder(folder, args.convention, names, args.protocol)
+/// Attributes of a file or folder, where one is given.
+pub(super) fn read_attributes(path: Option<&Path>) -> Result<Option<Attributes>, HostError> {
+    path.map(|p| Attributes::read(p).map_err(|e| unusable("--attributes", &e))).transpose()
+}
+
+/// The truth of the folder `gt`, or else of the dataset.
+pub(super) fn truth_of(
+    dataset: Option<&Dataset>,
+    gt: Option<&Path>,
+    convention: Convention,
+    names: Option<&[String]>,
+    protocol: Option<Protocol>,
+) -> Result<TruthSet, HostError> {
+    if let Some(folder) = gt {
+        return TruthSet::read_folder(folder, convention, names, protocol)
             .map_err(|e| unusable("--gt", &e));
     }
-    let text = args.dataset.as_deref().unwrap_or_default();
-    let data = tsda_eval::dataset::open(text).map_err(|e| unusable("--dataset", &e))?;
-    let mut set = TruthSet::of_dataset(&data, args.convention, args.protocol);
+    let Some(data) = dataset else { return Ok(TruthSet::default()) };
+    let text = &data.name;
+    let mut set = TruthSet::of_dataset(data, convention, protocol);
     if let Some(names) = names {
         if let Some(gone) = names.iter().find(|n| set.sequences.iter().all(|s| s.name != **n)) {
             return Err(unusable(
                 "--sequences",
-                &format!("'{gone}' has no truth of convention {} in {text}", args.convention),
+                &format!("'{gone}' has no truth of convention {convention} in {text}"),
             ));
         }
         set.sequences.retain(|s| names.contains(&s.name));
@@ -137,20 +173,20 @@ fn truth(args: &CompareArgs, names: Option<&[String]>) -> Result<TruthSet, HostE
     if set.sequences.is_empty() {
         return Err(unusable(
             "--dataset",
-            &format!("{text} has no sequence with truth of convention {}", args.convention),
+            &format!("{text} has no sequence with truth of convention {convention}"),
         ));
     }
     Ok(set)
 }
 
 /// `DIR=NAME`; an equals sign within the path stays there when no name follows it.
-fn split_name(text: &str) -> (&str, Option<&str>) {
+pub(super) fn split_name(text: &str) -> (&str, Option<&str>) {
     match text.rsplit_once('=') {
         Some((path, name)) if !name.is_empty() && !name.contains(['/', '\\']) => (path, Some(name)),
         _ => (text, None),
     }
 }
 
-fn unusable(what: &str, reason: &dyn std::fmt::Display) -> HostError {
+pub(super) fn unusable(what: &str, reason: &dyn std::fmt::Display) -> HostError {
     HostError::Argument { what: what.into(), reason: reason.to_string() }
 }

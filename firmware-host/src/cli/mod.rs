@@ -13,6 +13,8 @@ mod info;
 mod render;
 mod replay;
 #[cfg(feature = "eval")]
+mod report;
+#[cfg(feature = "eval")]
 mod score;
 mod track;
 mod trax;
@@ -22,6 +24,8 @@ mod verify;
 pub use compare::CompareArgs;
 pub use render::RenderArgs;
 pub use replay::ReplayArgs;
+#[cfg(feature = "eval")]
+pub use report::ReportArgs;
 #[cfg(feature = "eval")]
 pub use score::{LayoutArg, LengthsArg, ScoreArgs};
 pub use trax::TraxArgs;
@@ -79,6 +83,9 @@ pub enum Command {
     /// Compare folders of results, of this or any other tracker
     #[cfg(feature = "eval")]
     Compare(CompareArgs),
+    /// Write results as one self-contained page: curves, tables, failures in pictures, model card
+    #[cfg(feature = "eval")]
+    Report(ReportArgs),
     /// List V4L2 cameras and their formats
     #[cfg(feature = "camera")]
     Devices,
@@ -244,6 +251,8 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Score(args) => score::run(args),
         #[cfg(feature = "eval")]
         Command::Compare(args) => compare::run(args),
+        #[cfg(feature = "eval")]
+        Command::Report(args) => report::run(args),
         #[cfg(feature = "camera")]
         Command::Devices => devices::run(),
     }

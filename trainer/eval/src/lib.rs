@@ -54,6 +54,7 @@ pub mod metrics;
 pub mod otb;
 pub mod protocol;
 pub mod pseudo;
+pub mod report;
 pub mod report_data;
 pub mod results;
 mod rng;
