@@ -116,7 +116,13 @@ pub(super) fn run(args: &CompareArgs) -> Result<u8, HostError> {
     if let Some(page) = &args.report {
         let data = dataset.as_ref();
         super::report::of_comparison(
-            page, &report, &trackers, &truth, data, args.protocol, options,
+            page,
+            &report,
+            &trackers,
+            &truth,
+            data,
+            args.protocol,
+            options,
         )?;
     }
     if !args.frames {

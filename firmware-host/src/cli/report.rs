@@ -98,9 +98,8 @@ pub(super) fn run(args: &ReportArgs) -> Result<u8, HostError> {
         .as_deref()
         .map(|text| tsda_eval::dataset::open(text).map_err(|e| unusable("--dataset", &e)))
         .transpose()?;
-    let truth = |protocol| {
-        truth_of(dataset.as_ref(), args.gt.as_deref(), args.convention, None, protocol)
-    };
+    let truth =
+        |protocol| truth_of(dataset.as_ref(), args.gt.as_deref(), args.convention, None, protocol);
     let source = Source {
         dataset: dataset.as_ref(),
         truth: &truth,

@@ -214,8 +214,11 @@ fn table(h: &mut Html, lines: &[&str]) {
     let row = |h: &mut Html, line: &str, head: bool| {
         h.within("tr", &[], |h| {
             for (k, cell) in cells(line).iter().enumerate() {
-                let scope: &[(&str, &str)] =
-                    if head { &[("scope", "col"), ("class", class(k))] } else { &[("class", class(k))] };
+                let scope: &[(&str, &str)] = if head {
+                    &[("scope", "col"), ("class", class(k))]
+                } else {
+                    &[("class", class(k))]
+                };
                 h.within(if head { "th" } else { "td" }, scope, |h| inline(h, cell));
             }
         });

@@ -298,7 +298,11 @@ fn part(rows: &[Row], [width, height]: [f64; 2]) -> Row {
     let Some([x0, y0, x1, y1]) = edges else { return full };
     let mut w = ((x1 - x0) * 1.4).max(64.0);
     let mut h = ((y1 - y0) * 1.4).max(48.0);
-    if w * 3.0 > h * 4.0 { h = w * 0.75 } else { w = h / 0.75 }
+    if w * 3.0 > h * 4.0 {
+        h = w * 0.75
+    } else {
+        w = h / 0.75
+    }
     let (w, h) = (w.min(width).round(), h.min(height).round());
     let x = ((x0 + x1 - w) / 2.0).clamp(0.0, width - w).floor();
     let y = ((y0 + y1 - h) / 2.0).clamp(0.0, height - h).floor();

@@ -62,7 +62,9 @@ impl Default for ReportOptions {
 #[non_exhaustive]
 pub enum ReportError {
     /// Even without pictures and tables of sequences the page is too large.
-    #[error("the report needs {needed} bytes without any picture, {limit} are allowed: raise the limit or compare fewer trackers")]
+    #[error(
+        "the report needs {needed} bytes without any picture, {limit} are allowed: raise the limit or compare fewer trackers"
+    )]
     TooLarge {
         /// Bytes of the page without pictures and tables of sequences.
         needed: usize,

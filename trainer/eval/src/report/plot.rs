@@ -57,7 +57,11 @@ const BOTTOM: f64 = 40.0;
 fn step(end: f64, most: f64) -> f64 {
     let raw = (end / most).max(f64::MIN_POSITIVE);
     let power = 10f64.powf(raw.log10().floor());
-    [1.0, 2.0, 5.0].map(|m| m * power).into_iter().find(|s| *s >= raw * 0.999).unwrap_or(10.0 * power)
+    [1.0, 2.0, 5.0]
+        .map(|m| m * power)
+        .into_iter()
+        .find(|s| *s >= raw * 0.999)
+        .unwrap_or(10.0 * power)
 }
 
 /// A number on an axis of steps `step`.
@@ -76,14 +80,10 @@ pub(super) fn svg(
 ) {
     let view = format!("0 0 {} {}", at(width), at(height));
     let label = if about.is_empty() { title.to_owned() } else { format!("{title}. {about}") };
-    h.within(
-        "svg",
-        &[("viewBox", &view), ("role", "img"), ("aria-label", &label)],
-        |h| {
-            h.element("title", &[], title);
-            inside(h);
-        },
-    );
+    h.within("svg", &[("viewBox", &view), ("role", "img"), ("aria-label", &label)], |h| {
+        h.element("title", &[], title);
+        inside(h);
+    });
 }
 
 fn label(h: &mut Html, [x, y]: [f64; 2], anchor: &str, class: &str, text: &str) {
@@ -112,7 +112,13 @@ fn rect(h: &mut Html, class: &str, [x, y, w, hh]: [f64; 4]) {
 pub(super) fn key(h: &mut Html, index: usize) {
     h.within(
         "svg",
-        &[("class", "key"), ("viewBox", "0 0 26 8"), ("width", "26"), ("height", "8"), ("aria-hidden", "true")],
+        &[
+            ("class", "key"),
+            ("viewBox", "0 0 26 8"),
+            ("width", "26"),
+            ("height", "8"),
+            ("aria-hidden", "true"),
+        ],
         |h| {
             let class = format!("s{}", colour(index));
             h.empty(
@@ -255,9 +261,7 @@ pub(super) fn histogram(h: &mut Html, chart: &Histogram<'_>) {
         chart.classes.iter().map(|c| shares(c.values, chart.range, chart.bins)).collect();
     let top = shares.iter().flatten().copied().fold(0.01, f64::max) * 1.05;
     let [low, high] = chart.range;
-    let x = |v: f64| {
-        LEFT + ((v - low) / (high - low)).clamp(0.0, 1.0) * (WIDTH - LEFT - RIGHT)
-    };
+    let x = |v: f64| LEFT + ((v - low) / (high - low)).clamp(0.0, 1.0) * (WIDTH - LEFT - RIGHT);
     let y = |v: f64| HEIGHT - BOTTOM - v / top * (HEIGHT - TOP - BOTTOM);
     let about: Vec<String> =
         chart.classes.iter().map(|c| format!("{}: {} frames", c.name, c.values.len())).collect();
@@ -279,18 +283,26 @@ pub(super) fn histogram(h: &mut Html, chart: &Histogram<'_>) {
             }
             for (v, name) in chart.marks {
                 line(h, "mark", [x(*v), y(0.0)], [x(*v), TOP]);
-                let (dx, anchor) = if x(*v) > WIDTH * 0.75 { (-3.0, "end") } else { (3.0, "start") };
+                let (dx, anchor) =
+                    if x(*v) > WIDTH * 0.75 { (-3.0, "end") } else { (3.0, "start") };
                 label(h, [x(*v) + dx, TOP + 9.0], anchor, "small", name);
             }
         });
         h.within("ul", &[("class", "legend")], |h| {
             for class in &chart.classes {
                 let c = colour(class.index);
-                let style = if class.hollow { format!("f{c} s{c} hollow") } else { format!("f{c}") };
+                let style =
+                    if class.hollow { format!("f{c} s{c} hollow") } else { format!("f{c}") };
                 h.within("li", &[], |h| {
                     h.within(
                         "svg",
-                        &[("class", "key"), ("viewBox", "0 0 26 10"), ("width", "26"), ("height", "10"), ("aria-hidden", "true")],
+                        &[
+                            ("class", "key"),
+                            ("viewBox", "0 0 26 10"),
+                            ("width", "26"),
+                            ("height", "10"),
+                            ("aria-hidden", "true"),
+                        ],
                         |h| rect(h, &style, [1.0, 1.0, 24.0, 8.0]),
                     );
                     h.element("span", &[], class.name);
@@ -352,7 +364,13 @@ pub(super) fn bars(h: &mut Html, chart: &Groups<'_>) {
                     let y = top + k as f64 * BAR;
                     let class = format!("f{}", colour(*index));
                     rect(h, &class, [x(0.0), y + 1.0, x(v) - x(0.0), BAR - 2.0]);
-                    label(h, [x(v) + 4.0, y + BAR - 3.0], "start", "small", &crate::report_data::shown(v));
+                    label(
+                        h,
+                        [x(v) + 4.0, y + BAR - 3.0],
+                        "start",
+                        "small",
+                        &crate::report_data::shown(v),
+                    );
                 }
             }
         });
@@ -382,7 +400,13 @@ pub(super) fn radar(h: &mut Html, chart: &Groups<'_>) {
             let [cx, _] = place(0, 0.0);
             for ring in [0.5, 1.0] {
                 let [_, y] = place(0, ring * rim);
-                label(h, [cx + 3.0, y + 11.0], "start", "small", &crate::report_data::shown(ring * rim));
+                label(
+                    h,
+                    [cx + 3.0, y + 11.0],
+                    "start",
+                    "small",
+                    &crate::report_data::shown(ring * rim),
+                );
             }
             for (i, name) in chart.names.iter().enumerate() {
                 line(h, "grid", place(i, 0.0), place(i, rim));
@@ -467,7 +491,13 @@ pub(super) fn timeline(h: &mut Html, chart: &Timeline<'_>) {
         for (k, frame) in chart.shown.iter().enumerate() {
             let at_x = x(*frame as f64 + 0.5);
             line(h, "mark", [at_x, T], [at_x, H - B]);
-            label(h, [at_x, T - 4.0], "middle", "small", &char::from(b'a' + (k % 26) as u8).to_string());
+            label(
+                h,
+                [at_x, T - 4.0],
+                "middle",
+                "small",
+                &char::from(b'a' + (k % 26) as u8).to_string(),
+            );
         }
         let dx = step(n, 10.0).max(1.0);
         for i in 0..=(n / dx) as usize {
@@ -483,7 +513,9 @@ mod tests {
 
     #[test]
     fn axes_have_round_numbers() {
-        for (end, most, want) in [(1.0, 5.0, 0.2), (50.0, 6.0, 10.0), (0.5, 6.0, 0.1), (3.0, 5.0, 1.0)] {
+        for (end, most, want) in
+            [(1.0, 5.0, 0.2), (50.0, 6.0, 10.0), (0.5, 6.0, 0.1), (3.0, 5.0, 1.0)]
+        {
             assert!((step(end, most) - want).abs() < 1e-9, "{end} {most}: {}", step(end, most));
         }
         assert_eq!((tick(0.4, 0.2), tick(20.0, 10.0)), ("0.4".into(), "20".into()));

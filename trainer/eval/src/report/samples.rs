@@ -18,8 +18,7 @@ use crate::metrics::recovery::RECOVERED_IOU;
 use crate::report_data::TrackerData;
 use crate::results::ResultFolder;
 
-const SCORES: [&str; 4] =
-    ["_score.txt", "_scores.txt", "_confidence.txt", "_confidence.value"];
+const SCORES: [&str; 4] = ["_score.txt", "_scores.txt", "_confidence.txt", "_confidence.value"];
 const TIMES: [&str; 3] = ["_time.txt", "_times.txt", "_time.value"];
 
 /// Single frames of one tracker under one protocol; the initial frames are left out.
@@ -188,14 +187,13 @@ mod tests {
             absent: vec![0.1],
             milliseconds: vec![],
         };
-        for text in ["1\n0.8\n0.3\n0.1\n0.7\n", "0.8\n0.3\n0.1\n0.7", "\n0.8\r\n0.3\n0.1\n0.7\n\n"] {
+        for text in ["1\n0.8\n0.3\n0.1\n0.7\n", "0.8\n0.3\n0.1\n0.7", "\n0.8\r\n0.3\n0.1\n0.7\n\n"]
+        {
             let found = read(&[("s.txt", "0"), ("s_score.txt", text)], &IOU).unwrap();
             assert_eq!(found, want, "{text:?}");
         }
-        let nested = read(
-            &[("s/s_001.txt", "0"), ("s/s_time.txt", "9\n0.25\nnan\n0.5\n1\n")],
-            &IOU,
-        );
+        let nested =
+            read(&[("s/s_001.txt", "0"), ("s/s_time.txt", "9\n0.25\nnan\n0.5\n1\n")], &IOU);
         assert_eq!(nested.unwrap().milliseconds, [250.0, 500.0, 1000.0]);
         assert_eq!(read(&[("s.txt", "0")], &IOU).unwrap(), Samples::default());
         // Without overlaps scores cannot be judged, times can be told.

@@ -25,9 +25,9 @@ fn protocol_text(name: Option<&str>) -> (String, String) {
     let text = match name.parse() {
         Ok(Protocol::RgbToThermal) => "Marked in an RGB frame, followed in thermal frames.".into(),
         Ok(Protocol::ThermalToRgb) => "Marked in a thermal frame, followed in RGB frames.".into(),
-        Ok(Protocol::Switch { every }) => format!(
-            "Marked in an RGB frame; then thermal and RGB in turn, {every} frames each."
-        ),
+        Ok(Protocol::Switch { every }) => {
+            format!("Marked in an RGB frame; then thermal and RGB in turn, {every} frames each.")
+        }
         Ok(Protocol::Rgb) => "RGB frames throughout.".into(),
         Ok(Protocol::Thermal) => "Thermal frames throughout.".into(),
         Err(_) => String::new(),
@@ -46,12 +46,8 @@ fn plural(n: usize, what: &str) -> String {
 
 pub(super) fn header(h: &mut Html, data: &ReportData, title: &str, card: bool) {
     h.element("h1", &[], title);
-    let trackers: BTreeSet<&str> = data
-        .protocols
-        .iter()
-        .flat_map(|p| &p.trackers)
-        .map(|t| t.tracker.as_str())
-        .collect();
+    let trackers: BTreeSet<&str> =
+        data.protocols.iter().flat_map(|p| &p.trackers).map(|t| t.tracker.as_str()).collect();
     let sequences = data.protocols.iter().map(|p| p.sequences.len()).max().unwrap_or(0);
     h.within("p", &[("class", "soft")], |h| {
         h.text("Dataset ");
@@ -134,7 +130,11 @@ fn figure_table(
                             if first {
                                 h.element(
                                     "th",
-                                    &[("scope", "rowgroup"), ("class", "l"), ("rowspan", &rows.len().to_string())],
+                                    &[
+                                        ("scope", "rowgroup"),
+                                        ("class", "l"),
+                                        ("rowspan", &rows.len().to_string()),
+                                    ],
                                     name,
                                 );
                             }
@@ -249,7 +249,13 @@ pub(super) fn protocol(
 
 fn curves(h: &mut Html, data: &ReportData, p: &ProtocolData) {
     let convention = data.convention;
-    let chart = |h: &mut Html, title, x_label, thresholds: &[f64], column: &str, mark, get: &dyn Fn(&TrackerData) -> Vec<f64>| {
+    let chart = |h: &mut Html,
+                 title,
+                 x_label,
+                 thresholds: &[f64],
+                 column: &str,
+                 mark,
+                 get: &dyn Fn(&TrackerData) -> Vec<f64>| {
         let figure = Figures::columns(convention).into_iter().find(|c| c.0 == column);
         let series = p
             .trackers
@@ -273,9 +279,15 @@ fn curves(h: &mut Html, data: &ReportData, p: &ProtocolData) {
         chart(h, "Success", "overlap (IoU) above", &t.success, "auc", None, &|t| {
             t.overall.curves.success.clone()
         });
-        chart(h, "Precision", "centre error within, pixels", &t.precision, key, Some(pixels), &|t| {
-            t.overall.curves.precision.clone()
-        });
+        chart(
+            h,
+            "Precision",
+            "centre error within, pixels",
+            &t.precision,
+            key,
+            Some(pixels),
+            &|t| t.overall.curves.precision.clone(),
+        );
         let label = "centre error within, share of the target's size";
         let normalised = &t.normalised_precision;
         chart(h, "Normalised precision", label, normalised, "npr", Some(0.2), &|t| {
@@ -305,7 +317,8 @@ fn recovery(h: &mut Html, data: &ReportData, p: &ProtocolData) {
             h.within("thead", &[], |h| {
                 h.within("tr", &[], |h| {
                     h.element("th", &[("scope", "col"), ("class", "l")], "tracker");
-                    for name in ["switches", "recovered", "undisturbed", "mean time", "median time"] {
+                    for name in ["switches", "recovered", "undisturbed", "mean time", "median time"]
+                    {
                         h.element("th", &[("scope", "col")], name);
                     }
                 });
@@ -342,15 +355,16 @@ fn recovery(h: &mut Html, data: &ReportData, p: &ProtocolData) {
         t.sequences.values().flat_map(|s| &s.recoveries).map(|r| r.frames).collect()
     };
     let longest = p.trackers.iter().flat_map(times).flatten().max().unwrap_or(0);
-    let series = p.trackers.iter().enumerate().filter(|(_, t)| t.recovery.is_some()).map(|(index, t)| {
-        let times = times(t);
-        let points = (0..=longest.max(1)).map(|x| {
-            let by = times.iter().flatten().filter(|v| **v <= x).count();
-            [x as f64, by as f64 / times.len().max(1) as f64]
+    let series =
+        p.trackers.iter().enumerate().filter(|(_, t)| t.recovery.is_some()).map(|(index, t)| {
+            let times = times(t);
+            let points = (0..=longest.max(1)).map(|x| {
+                let by = times.iter().flatten().filter(|v| **v <= x).count();
+                [x as f64, by as f64 / times.len().max(1) as f64]
+            });
+            let rate = t.recovery.map_or(String::new(), |r| format!("{} %", shown(r.rate)));
+            Series { index, name: &t.tracker, figure: rate, points: points.collect() }
         });
-        let rate = t.recovery.map_or(String::new(), |r| format!("{} %", shown(r.rate)));
-        Series { index, name: &t.tracker, figure: rate, points: points.collect() }
-    });
     let chart = Lines {
         title: "Switches recovered",
         x_label: "within visible frames after the switch",
@@ -392,9 +406,7 @@ fn grouped(
             .trackers
             .iter()
             .enumerate()
-            .map(|(i, t)| {
-                (i, t.tracker.as_str(), names.iter().map(|n| of(t, n)).collect())
-            })
+            .map(|(i, t)| (i, t.tracker.as_str(), names.iter().map(|n| of(t, n)).collect()))
             .collect(),
     };
     // Switches are an order, attributes are not; and a radar of a dozen lines cannot be read.
@@ -501,8 +513,8 @@ fn failures(h: &mut Html, p: &ProtocolData, extra: &ProtocolExtras, strips: &[St
     h.element("h3", &[], &format!("Where {} fails", first.tracker));
     if extra.strips.is_empty() {
         let judged = first.sequences.values().any(|s| !s.iou.is_empty());
-        let all_held = judged
-            && first.sequences.values().all(|s| super::first_failure(&s.iou).is_none());
+        let all_held =
+            judged && first.sequences.values().all(|s| super::first_failure(&s.iou).is_none());
         let text = if all_held {
             "In no frame of any sequence does the IoU fall below 0.5."
         } else {
@@ -521,29 +533,55 @@ fn failures(h: &mut Html, p: &ProtocolData, extra: &ProtocolExtras, strips: &[St
         ),
     );
     h.within("ul", &[("class", "legend"), ("style", "max-width:20rem")], |h| {
-        let entries = p.trackers.iter().take(DRAWN).enumerate().map(|(k, t)| {
-            (format!("box on{k}"), BOX_DASHES[k], t.tracker.as_str())
-        });
-        for (class, dash, name) in [("box ontruth".to_owned(), "none", "truth")].into_iter().chain(entries) {
+        let entries = p
+            .trackers
+            .iter()
+            .take(DRAWN)
+            .enumerate()
+            .map(|(k, t)| (format!("box on{k}"), BOX_DASHES[k], t.tracker.as_str()));
+        for (class, dash, name) in
+            [("box ontruth".to_owned(), "none", "truth")].into_iter().chain(entries)
+        {
             h.within("li", &[], |h| {
                 h.within(
                     "svg",
-                    &[("class", "key"), ("viewBox", "0 0 26 14"), ("width", "26"), ("height", "14"), ("aria-hidden", "true")],
+                    &[
+                        ("class", "key"),
+                        ("viewBox", "0 0 26 14"),
+                        ("width", "26"),
+                        ("height", "14"),
+                        ("aria-hidden", "true"),
+                    ],
                     |h| {
                         h.empty(
                             "rect",
-                            &[("class", &class), ("stroke-dasharray", dash), ("x", "2"), ("y", "2"), ("width", "22"), ("height", "10")],
+                            &[
+                                ("class", &class),
+                                ("stroke-dasharray", dash),
+                                ("x", "2"),
+                                ("y", "2"),
+                                ("width", "22"),
+                                ("height", "10"),
+                            ],
                         );
                     },
                 );
                 h.element("span", &[], name);
             });
         }
-        for (class, name) in [("rgb", "RGB frames"), ("thermal", "thermal frames"), ("failed", "failure")] {
+        for (class, name) in
+            [("rgb", "RGB frames"), ("thermal", "thermal frames"), ("failed", "failure")]
+        {
             h.within("li", &[], |h| {
                 h.within(
                     "svg",
-                    &[("class", "key"), ("viewBox", "0 0 26 14"), ("width", "26"), ("height", "14"), ("aria-hidden", "true")],
+                    &[
+                        ("class", "key"),
+                        ("viewBox", "0 0 26 14"),
+                        ("width", "26"),
+                        ("height", "14"),
+                        ("aria-hidden", "true"),
+                    ],
                     |h| h.empty("rect", &[("class", class), ("width", "26"), ("height", "14")]),
                 );
                 h.element("span", &[], name);
@@ -575,7 +613,12 @@ pub(super) fn strip(p: &ProtocolData, strip: &Strip) -> String {
         h.element(
             "p",
             &[("class", "soft")],
-            &format!("{mean}{kind} from frame {} to {} of {}.", failure.start, failure.end - 1, strip.iou.len()),
+            &format!(
+                "{mean}{kind} from frame {} to {} of {}.",
+                failure.start,
+                failure.end - 1,
+                strip.iou.len()
+            ),
         );
         if !strip.pictures.is_empty() {
             h.within("div", &[("class", "pictures")], |h| {
@@ -587,8 +630,12 @@ pub(super) fn strip(p: &ProtocolData, strip: &Strip) -> String {
         if let Some(note) = &strip.note {
             h.element("p", &[("class", "soft")], &format!("No pictures: {note}."));
         }
-        let thermal: Vec<bool> =
-            strip.modalities.iter().take(strip.iou.len()).map(|m| *m == Modality::Thermal).collect();
+        let thermal: Vec<bool> = strip
+            .modalities
+            .iter()
+            .take(strip.iou.len())
+            .map(|m| *m == Modality::Thermal)
+            .collect();
         let shown: Vec<usize> = strip.pictures.iter().map(|s| s.frame).collect();
         let title = format!("IoU over the frames of {}", strip.sequence);
         h.within("figure", &[], |h| {
@@ -626,14 +673,28 @@ fn strip_picture(h: &mut Html, k: usize, picture: &StripPicture) {
                 let uri = format!("data:image/jpeg;base64,{}", base64(&picture.jpeg));
                 h.empty(
                     "image",
-                    &[("href", &uri), ("x", &x), ("y", &y), ("width", &w), ("height", &hh), ("preserveAspectRatio", "none")],
+                    &[
+                        ("href", &uri),
+                        ("x", &x),
+                        ("y", &y),
+                        ("width", &w),
+                        ("height", &hh),
+                        ("preserveAspectRatio", "none"),
+                    ],
                 );
                 let mut draw = |row: &crate::metrics::Row, class: &str, dash: &str| {
                     let [x, y, w, hh] = row.map(at);
                     for (class, dash) in [("halo", "none"), (class, dash)] {
                         h.empty(
                             "rect",
-                            &[("class", class), ("stroke-dasharray", dash), ("x", &x), ("y", &y), ("width", &w), ("height", &hh)],
+                            &[
+                                ("class", class),
+                                ("stroke-dasharray", dash),
+                                ("x", &x),
+                                ("y", &y),
+                                ("width", &w),
+                                ("height", &hh),
+                            ],
                         );
                     }
                 };
@@ -646,7 +707,11 @@ fn strip_picture(h: &mut Html, k: usize, picture: &StripPicture) {
                 }
             },
         );
-        h.element("figcaption", &[], &format!("{letter}: frame {}, {sensor}, {iou}", picture.frame));
+        h.element(
+            "figcaption",
+            &[],
+            &format!("{letter}: frame {}, {sensor}, {iou}", picture.frame),
+        );
     });
 }
 

@@ -65,7 +65,8 @@ impl Workplace {
             write_otb(&dir.path().join("good"), &file, &all(&truth), None).unwrap();
             let scores: String =
                 (0..FRAMES).map(|f| format!("{}\n", if f < 30 { 0.9 } else { 0.2 })).collect();
-            let times: String = (0..FRAMES).map(|f| format!("{}\n", 0.01 + f as f64 / 1e4)).collect();
+            let times: String =
+                (0..FRAMES).map(|f| format!("{}\n", 0.01 + f as f64 / 1e4)).collect();
             write(dir.path(), &format!("bad/{file}_score.txt"), &scores);
             write(dir.path(), &format!("bad/{file}_time.txt"), &times);
         }
@@ -163,7 +164,7 @@ fn parse(page: &str) -> Vec<Element> {
         for element in &mut open {
             element.text.push_str(&text);
         }
-        let end = rest.find('>').expect("a closed tag");
+        let end = at + rest[at..].find('>').expect("a closed tag");
         let tag = &rest[at + 1..end];
         rest = &rest[end + 1..];
         if let Some(name) = tag.strip_prefix('/') {
@@ -175,8 +176,7 @@ fn parse(page: &str) -> Vec<Element> {
         let body = tag.strip_suffix('/').unwrap_or(tag);
         let (name, mut attrs) = body.split_once(' ').unwrap_or((body, ""));
         assert!(name.bytes().all(|b| b.is_ascii_alphanumeric()), "<{tag}>");
-        let mut element =
-            Element { name: name.to_owned(), attrs: Vec::new(), text: String::new() };
+        let mut element = Element { name: name.to_owned(), attrs: Vec::new(), text: String::new() };
         while !attrs.trim().is_empty() {
             let (key, after) = attrs.trim_start().split_once("=\"").expect("a quoted value");
             let (value, after) = after.split_once('"').expect("a closed value");
@@ -245,9 +245,13 @@ fn a_page_is_well_formed_and_holds_nothing_foreign() {
         assert!(named || e.attr("aria-hidden") == Some("true"), "{e:?}");
     }
     assert!(elements.iter().filter(|e| e.name == "th").all(|e| e.attr("scope").is_some()));
-    for heading in
-        ["Overview", "Attributes", "Model card", "Recovery after a sensor switch", "Protocol switch:20"]
-    {
+    for heading in [
+        "Overview",
+        "Attributes",
+        "Model card",
+        "Recovery after a sensor switch",
+        "Protocol switch:20",
+    ] {
         let found = elements.iter().any(|e| e.name.starts_with('h') && e.text == heading);
         assert!(found, "{heading}");
     }
