@@ -391,7 +391,7 @@ pub(super) fn radar(h: &mut Html, chart: &Groups<'_>) {
         [SIDE / 2.0 + r * angle.cos(), SIDE / 2.0 + 8.0 + r * angle.sin()]
     };
     h.within("figure", &[], |h| {
-        svg(h, [SIDE, SIDE], chart.title, "The values stand in the table.", |h| {
+        svg(h, [SIDE, SIDE - 30.0], chart.title, "The values stand in the table.", |h| {
             label(h, [0.0, 16.0], "start", "name", chart.title);
             for ring in [0.25, 0.5, 0.75, 1.0] {
                 let d = path((0..chart.names.len()).map(|i| place(i, ring * rim))) + "Z";

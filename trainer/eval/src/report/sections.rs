@@ -231,7 +231,9 @@ pub(super) fn protocol(
         curves(h, data, p);
         recovery(h, data, p);
         grouped(h, data.convention, p, "Attributes", "attribute", |t| &t.attributes);
-        grouped(h, data.convention, p, "Number of sensor switches", "switches", |t| &t.switches);
+        grouped(h, data.convention, p, "Number of sensor switches", "number of switches", |t| {
+            &t.switches
+        });
         frames(h, p, &extra.samples);
         failures(h, p, extra, strips);
         if with_sequences {
@@ -411,9 +413,12 @@ fn grouped(
     };
     // Switches are an order, attributes are not; and a radar of a dozen lines cannot be read.
     let radar = what == "attribute" && SPOKES.contains(&names.len()) && p.trackers.len() <= 8;
-    h.within("div", &[("class", "charts")], |h| {
-        if radar { plot::radar(h, &chart) } else { plot::bars(h, &chart) }
-    });
+    // A chart of one group compares nothing that the table does not.
+    if names.len() > 1 {
+        h.within("div", &[("class", "charts")], |h| {
+            if radar { plot::radar(h, &chart) } else { plot::bars(h, &chart) }
+        });
+    }
     let rows: Vec<(String, Vec<FigureRow<'_>>)> = names
         .iter()
         .map(|name| {
@@ -532,7 +537,7 @@ fn failures(h: &mut Html, p: &ProtocolData, extra: &ProtocolExtras, strips: &[St
              the one the target was marked in (a). Each sensor shows one part of its picture."
         ),
     );
-    h.within("ul", &[("class", "legend"), ("style", "max-width:20rem")], |h| {
+    h.within("ul", &[("class", "legend row")], |h| {
         let entries = p
             .trackers
             .iter()
