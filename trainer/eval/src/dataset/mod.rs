@@ -36,7 +36,7 @@ pub mod sequences;
 pub mod single;
 pub mod stills;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod text;
 mod tree;
 pub mod vtuav;
