@@ -1,11 +1,14 @@
 //! The online tracker (spec 3): one target, one frame at a time, no allocation.
 
 mod error;
+mod redetect;
 mod state;
 
 pub use error::{BoxError, TrackError, check_box};
+pub use redetect::RedetectOptions;
 pub use state::{Search, Target, TrackState};
 
+use crate::bundle::ScoreCalibration;
 use crate::crop::{self, Patch, Window, round_half_even};
 use crate::engine::{Engine, EngineError};
 use crate::frame::FrameView;
@@ -13,7 +16,8 @@ use crate::geometry::{BBox, Modality, Yx};
 use crate::labels;
 use crate::localise::{Cell, Flag, localise};
 use crate::memory::{Template, TemplateMemory};
-use crate::spec::{MAX_TEMPLATES, ModelSpec, TrackerParams};
+use crate::spec::{MAX_TEMPLATES, ModelSpec, SpecError, TrackerParams};
+use redetect::Scan;
 
 /// What one frame gave.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,6 +26,8 @@ pub struct Track {
     pub bbox: BBox,
     /// Highest score of the map: about 1 on the target, about 0 without it; not a probability.
     pub score: f32,
+    /// Probability that the box is right, in `[0, 1]`; `None` without [`Tracker::set_calibration`].
+    pub confidence: Option<f32>,
     /// How far the box can be relied on.
     pub state: TrackState,
     /// What the score map looked like.
@@ -32,6 +38,8 @@ pub struct Track {
     pub frame: u64,
     /// Frames without the target up to and including this one; 0 when it was found.
     pub missing: u32,
+    /// Whether the scan of a lost target's frame found it; see [`RedetectOptions`].
+    pub redetected: bool,
 }
 
 /// A single-object tracker on an engine.
@@ -46,6 +54,8 @@ pub struct Tracker<E> {
     memory: TemplateMemory<MAX_TEMPLATES>,
     target: Option<Target>,
     search: Option<Search>,
+    calibration: Option<ScoreCalibration>,
+    scan: Option<Scan>,
 }
 
 impl<E: Engine> Tracker<E> {
@@ -64,7 +74,16 @@ impl<E: Engine> Tracker<E> {
         fits(name, "template label", input.label.len(), spec.cells())?;
         fits(name, "template ltrb", input.ltrb.len(), 4 * spec.cells())?;
         let memory = TemplateMemory::new(spec.templates.into());
-        Ok(Self { engine, spec, params, memory, target: None, search: None })
+        Ok(Self {
+            engine,
+            spec,
+            params,
+            memory,
+            target: None,
+            search: None,
+            calibration: None,
+            scan: None,
+        })
     }
 
     /// Takes the target from the annotated frame (spec 3.2, 3.3). May be called again at any time
@@ -82,6 +101,9 @@ impl<E: Engine> Tracker<E> {
         self.target = None;
         self.search = None;
         self.memory.clear();
+        if let Some(scan) = &mut self.scan {
+            scan.restart();
+        }
 
         let target = Target::new(&bbox, &self.spec);
         let pos = target.pos();
@@ -113,7 +135,19 @@ impl<E: Engine> Tracker<E> {
         let Some(mut target) = self.target else {
             return Err(TrackError::NoTarget);
         };
-        let (search, score) = self.look(frame, &target)?;
+        let (mut search, mut score) = self.look(frame, &target)?;
+        let mut scan = self.scan;
+        let mut redetected = false;
+        if let Some(scan) = &mut scan {
+            if target.state() == TrackState::Lost && search.located.flag == Flag::NotFound {
+                if let Some(found) = self.scan_frame(frame, &target, scan)? {
+                    (search, score) = found;
+                    redetected = true;
+                }
+            } else {
+                scan.restart();
+            }
+        }
         let flag = search.located.flag;
         if flag == Flag::NotFound {
             target.miss();
@@ -122,7 +156,10 @@ impl<E: Engine> Tracker<E> {
         }
         target.step(flag, score, &self.params);
 
-        let learn = matches!(flag, Flag::Normal | Flag::HardNegative)
+        // The engine holds the features of the last crop it looked at, which after a scan need not
+        // be the one with the target; and a find from afar should prove itself first.
+        let learn = !redetected
+            && matches!(flag, Flag::Normal | Flag::HardNegative)
             && score > self.params.write_confidence;
         let mut wrote_memory = false;
         if let (true, Some(slot)) = (learn, self.memory.next_slot()) {
@@ -134,14 +171,17 @@ impl<E: Engine> Tracker<E> {
         // Nothing can fail any more: what was computed becomes the state.
         self.target = Some(target);
         self.search = Some(search);
+        self.scan = scan;
         Ok(Track {
             bbox: target.bbox(),
             score,
+            confidence: self.calibration.map(|c| c.probability(score)),
             state: target.state(),
             flag,
             wrote_memory,
             frame: target.frame(),
             missing: target.missing(),
+            redetected,
         })
     }
 
@@ -158,6 +198,26 @@ impl<E: Engine> Tracker<E> {
         error::check_size(&bbox)?;
         target.place(&bbox);
         Ok(())
+    }
+
+    /// Looks at the next positions of the grid; the best find above the threshold, if there is one.
+    fn scan_frame(
+        &mut self,
+        frame: &FrameView<'_>,
+        target: &Target,
+        scan: &mut Scan,
+    ) -> Result<Option<(Search, f32)>, TrackError> {
+        let threshold = scan.options().threshold;
+        let size = target.scale() * f32::from(self.spec.crop);
+        let mut best: Option<(Search, f32)> = None;
+        for centre in scan.positions((frame.height(), frame.width()), size) {
+            let (search, score) = self.look(frame, &target.moved_to(centre))?;
+            let higher = best.as_ref().is_none_or(|(_, other)| score > *other);
+            if search.located.flag != Flag::NotFound && score > threshold && higher {
+                best = Some((search, score));
+            }
+        }
+        Ok(best)
     }
 
     /// Steps 1 to 5 of spec 3.5: crop, network, cell, box. Changes nothing but the engine.
@@ -256,6 +316,44 @@ impl<E: Engine> Tracker<E> {
 }
 
 impl<E> Tracker<E> {
+    /// Has [`Track::confidence`] computed by this map; the one of the bundle is in its manifest.
+    ///
+    /// # Errors
+    /// When the map is out of range; the old one then stays.
+    pub fn set_calibration(
+        &mut self,
+        calibration: Option<ScoreCalibration>,
+    ) -> Result<(), SpecError> {
+        if let Some(c) = &calibration {
+            c.validate()?;
+        }
+        self.calibration = calibration;
+        Ok(())
+    }
+
+    /// The map from score to [`Track::confidence`].
+    pub const fn calibration(&self) -> Option<ScoreCalibration> {
+        self.calibration
+    }
+
+    /// Has the frame scanned for a target that is [`TrackState::Lost`]; `None`, the default, looks
+    /// only where it was last seen.
+    ///
+    /// # Errors
+    /// When the options are out of range; the old ones then stay.
+    pub fn set_redetection(&mut self, options: Option<RedetectOptions>) -> Result<(), SpecError> {
+        if let Some(o) = &options {
+            o.validate()?;
+        }
+        self.scan = options.map(Scan::new);
+        Ok(())
+    }
+
+    /// How the frame is scanned for a lost target, when it is.
+    pub fn redetection(&self) -> Option<RedetectOptions> {
+        self.scan.map(|s| s.options())
+    }
+
     /// The network's shape.
     pub const fn spec(&self) -> &ModelSpec {
         &self.spec

@@ -3,10 +3,11 @@
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use tsda_runtime::bundle::ScoreCalibration;
 use tsda_runtime::engine::{Maps, TemplateInput};
 use tsda_runtime::{
-    BBox, Engine, EngineError, Flag, FrameView, Modality, ModelSpec, PixelFormat, Tracker,
-    TrackerParams,
+    BBox, Engine, EngineError, Flag, FrameView, Modality, ModelSpec, PixelFormat, RedetectOptions,
+    TrackState, Tracker, TrackerParams,
 };
 
 struct Counting;
@@ -130,7 +131,12 @@ fn hundreds_of_frames_in_every_format_allocate_nothing() {
         (PixelFormat::Nv12, 1),
     ];
     for spec in [ModelSpec::NANO, ModelSpec { crop: 96, templates: 4, ..ModelSpec::NANO }] {
-        let mut tracker = Tracker::new(Scripted::new(spec), TrackerParams::default()).unwrap();
+        // Soon lost, so that the scan for a lost target is in the count.
+        let params = TrackerParams { lost_after: 2, ..TrackerParams::default() };
+        let mut tracker = Tracker::new(Scripted::new(spec), params).unwrap();
+        tracker.set_redetection(Some(RedetectOptions::default())).unwrap();
+        tracker.set_calibration(Some(ScoreCalibration { slope: 5.0, bias: -2.0 })).unwrap();
+        let mut lost = 0;
         let (mut frames, mut writes, mut missed, mut rivals) = (0, 0, 0, 0);
         for (i, (format, bytes)) in formats.into_iter().cycle().take(12).enumerate() {
             // Two sizes, so that the switch between formats also changes the geometry.
@@ -161,10 +167,12 @@ fn hundreds_of_frames_in_every_format_allocate_nothing() {
                 frames += 1;
                 writes += usize::from(track.wrote_memory);
                 missed += usize::from(track.flag == Flag::NotFound);
+                lost += usize::from(track.state == TrackState::Lost);
+                assert!(track.confidence.is_some());
                 rivals += usize::from(matches!(track.flag, Flag::Uncertain | Flag::HardNegative));
             }
         }
         println!("{frames} frames, {writes} memory writes, {missed} not found: 0 allocations");
-        assert!(frames == 600 && writes > 100 && missed > 100 && rivals > 50);
+        assert!(frames == 600 && writes > 100 && missed > 100 && rivals > 50 && lost > 50);
     }
 }

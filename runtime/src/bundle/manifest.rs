@@ -1,6 +1,6 @@
 //! What a bundle says about itself.
 
-use crate::spec::{ModelSpec, TrackerParams};
+use crate::spec::{ModelSpec, SpecError, TrackerParams};
 use serde::{Deserialize, Serialize};
 
 /// The manifest: borrowed from the file's bytes, no allocation.
@@ -48,6 +48,29 @@ pub struct ScoreCalibration {
     pub slope: f32,
     /// Bias.
     pub bias: f32,
+}
+
+impl ScoreCalibration {
+    /// Probability of a right box at this score, in `[0, 1]`.
+    pub fn probability(&self, score: f32) -> f32 {
+        1.0 / (1.0 + libm::expf(-(self.slope * score + self.bias)))
+    }
+
+    /// Checks that a higher score never means a lower probability.
+    ///
+    /// # Errors
+    /// Names the field that is out of range.
+    pub fn validate(&self) -> Result<(), SpecError> {
+        if !(self.slope.is_finite() && self.slope > 0.0) {
+            let (field, want) = ("calibration.slope", "a finite number above 0");
+            return Err(SpecError { field, value: self.slope, want });
+        }
+        if !self.bias.is_finite() {
+            let (field, want) = ("calibration.bias", "a finite number");
+            return Err(SpecError { field, value: self.bias, want });
+        }
+        Ok(())
+    }
 }
 
 /// How the weights were made.

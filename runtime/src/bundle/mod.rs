@@ -16,11 +16,15 @@
 //! last section does.
 
 #[cfg(feature = "std")]
+mod encode;
+#[cfg(feature = "std")]
 mod file;
 mod manifest;
 #[cfg(all(test, feature = "std"))]
 mod tests;
 
+#[cfg(feature = "std")]
+pub use encode::{EncodeError, encode};
 #[cfg(feature = "std")]
 pub use file::{BundleFile, BundleFileError};
 pub use manifest::{
@@ -214,6 +218,9 @@ impl<'a> Bundle<'a> {
         }
         manifest.spec.validate()?;
         manifest.tracker.validate()?;
+        if let Some(calibration) = &manifest.calibration {
+            calibration.validate()?;
+        }
         check_sections(bytes, &manifest.sections, manifest_end)?;
         Ok(Self { bytes, manifest })
     }
@@ -247,6 +254,11 @@ impl<'a> Bundle<'a> {
             SectionKind::PredictOnnx(templates) => Some(templates),
             _ => None,
         })
+    }
+
+    /// The sections in file order.
+    pub fn sections(&self) -> impl Iterator<Item = (SectionKind, &'a [u8])> + '_ {
+        self.manifest.sections.iter().filter_map(|s| Some((s.kind, self.section(s.kind)?)))
     }
 
     /// The whole file.

@@ -199,3 +199,22 @@ proptest! {
         prop_assert!(Bundle::parse(&bytes).is_err());
     }
 }
+
+#[test]
+fn another_calibration_leaves_every_section_as_it_was() {
+    let old = sample();
+    let bundle = Bundle::parse(&old).unwrap();
+    let sections: Vec<_> = bundle.sections().collect();
+    assert_eq!(sections.len(), SECTIONS.len());
+    for calibration in [None, Some(ScoreCalibration { slope: 9.0, bias: -5.5 })] {
+        let manifest = Manifest { calibration, ..bundle.manifest().clone() };
+        let new = encode(&manifest, &sections).unwrap();
+        let new = Bundle::parse(&new).unwrap();
+        assert_eq!(new.manifest().calibration, calibration);
+        assert_eq!(new.sections().collect::<Vec<_>>(), sections);
+    }
+    let upside_down = Some(ScoreCalibration { slope: -1.0, bias: 0.0 });
+    let manifest = Manifest { calibration: upside_down, ..bundle.manifest().clone() };
+    let error = encode(&manifest, &sections).unwrap_err().to_string();
+    assert!(error.contains("calibration.slope"), "{error}");
+}

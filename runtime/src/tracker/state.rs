@@ -210,6 +210,12 @@ impl Target {
         }
     }
 
+    /// The same target at another position (pixel-centre coordinates), with the size and scale it
+    /// had.
+    pub(super) const fn moved_to(&self, pos: Yx) -> Self {
+        Self { pos, ..*self }
+    }
+
     fn scale_of(&self, bbox: &BBox) -> f32 {
         libm::sqrtf(bbox.h * bbox.w / (self.base.y * self.base.x))
     }

@@ -289,3 +289,141 @@ proptest! {
         }
     }
 }
+
+/// A tracker whose target has been gone for long enough to be lost.
+fn lost(options: Option<RedetectOptions>) -> (Tracker<ScriptedEngine>, Vec<u8>) {
+    let (mut tracker, picture) = started();
+    tracker.params.lost_after = 2;
+    tracker.init(&view(&picture), BBox::new(20.0, 20.0, 6.0, 6.0), None).unwrap();
+    tracker.set_redetection(options).unwrap();
+    answer(tracker.engine_mut(), (0, 0), 0.1, 20.0);
+    for _ in 0..2 {
+        tracker.update(&view(&picture), None).unwrap();
+    }
+    assert_eq!(tracker.target().unwrap().state(), TrackState::Lost);
+    tracker.engine_mut().asked.clear();
+    (tracker, picture)
+}
+
+#[test]
+fn a_lost_target_is_looked_for_over_the_frame_at_a_bounded_cost() {
+    for (positions_per_frame, runs) in [(1, 2), (3, 4)] {
+        let options = RedetectOptions { positions_per_frame, threshold: 0.5 };
+        let (mut tracker, picture) = lost(Some(options));
+        let before = *tracker.target().unwrap();
+        let track = tracker.update(&view(&picture), None).unwrap();
+        assert_eq!((track.state, track.redetected), (TrackState::Lost, false));
+        assert_eq!((track.bbox, track.score), (before.bbox(), 0.1));
+        assert_eq!(tracker.engine().asked.len(), runs);
+    }
+    // Off, the default: one run, the same answer.
+    let (mut tracker, picture) = lost(None);
+    tracker.update(&view(&picture), None).unwrap();
+    assert_eq!((tracker.engine().asked.len(), tracker.redetection()), (1, None));
+}
+
+/// Scores by how bright the middle of the crop is: a target that can be drawn into the picture.
+#[derive(Debug)]
+struct Bright(ScriptedEngine);
+
+impl Engine for Bright {
+    fn spec(&self) -> &ModelSpec {
+        self.0.spec()
+    }
+    fn name(&self) -> &'static str {
+        "bright"
+    }
+    fn crop_mut(&mut self) -> &mut [f32] {
+        self.0.crop_mut()
+    }
+    fn features(&mut self) -> Result<(), EngineError> {
+        let (side, map) = (self.0.spec.crop_side(), self.0.spec.map_side());
+        for row in 0..map {
+            for col in 0..map {
+                let at = (row * 16 + 8) * side + col * 16 + 8;
+                let white = (1.0 - 0.485) / 0.229;
+                self.0.answer.0[row * map + col] = self.0.crop[at] / white * 0.95;
+            }
+        }
+        Ok(())
+    }
+    fn template_input_mut(&mut self) -> crate::engine::TemplateInput<'_> {
+        self.0.template_input_mut()
+    }
+    fn write_template(&mut self, slot: usize) -> Result<(), EngineError> {
+        self.0.write_template(slot)
+    }
+    fn predict(&mut self, filled: usize) -> Result<crate::engine::Maps<'_>, EngineError> {
+        self.0.predict(filled)
+    }
+}
+
+/// Frames until a target that comes back in the opposite corner is found; 100 when it never is.
+fn frames_to_find(options: Option<RedetectOptions>) -> (usize, Vec<usize>) {
+    let (w, h) = (160, 120);
+    let draw = |at: Option<(usize, usize)>| {
+        let mut data = vec![0u8; w * h];
+        if let Some((y, x)) = at {
+            for row in y..y + 12 {
+                data[row * w + x..row * w + x + 12].fill(255);
+            }
+        }
+        data
+    };
+    let engine = Bright(ScriptedEngine::new(SPEC));
+    let params = TrackerParams { lost_after: 3, min_size: 4.0, ..TrackerParams::default() };
+    let mut tracker = Tracker::new(engine, params).unwrap();
+    tracker.set_redetection(options).unwrap();
+    let seen = draw(Some((10, 10)));
+    let frame = FrameView::gray(&seen, w, h).unwrap();
+    tracker.init(&frame, BBox::new(10.0, 10.0, 12.0, 12.0), None).unwrap();
+    let empty = draw(None);
+    let frame = FrameView::gray(&empty, w, h).unwrap();
+    for _ in 0..6 {
+        tracker.update(&frame, None).unwrap();
+    }
+    let back = draw(Some((96, 130)));
+    let frame = FrameView::gray(&back, w, h).unwrap();
+    for i in 0..100 {
+        let track = tracker.update(&frame, None).unwrap();
+        if track.flag != Flag::NotFound {
+            assert_eq!((track.redetected, track.wrote_memory), (options.is_some(), false));
+            assert!(track.bbox.overlaps_image(w, h) && track.bbox.x > 100.0 && track.bbox.y > 70.0);
+            assert!(matches!(track.state, TrackState::Uncertain | TrackState::Tracking));
+            let again = tracker.update(&frame, None).unwrap();
+            assert!(again.flag != Flag::NotFound && !again.redetected);
+            return (i, tracker.engine().0.written.clone());
+        }
+    }
+    (100, tracker.engine().0.written.clone())
+}
+
+#[test]
+fn a_target_that_returns_elsewhere_is_found_by_the_scan_only() {
+    let (without, written) = frames_to_find(None);
+    assert_eq!((without, written), (100, vec![0]));
+    let scan = |n| Some(RedetectOptions { positions_per_frame: n, threshold: 0.6 });
+    let (slow, _) = frames_to_find(scan(1));
+    let (fast, _) = frames_to_find(scan(4));
+    println!("frames to find: {slow} with 1 position per frame, {fast} with 4");
+    assert!(slow < 40 && fast <= slow.div_ceil(4));
+    // Above what the target scores: never.
+    let (deaf, _) = frames_to_find(Some(RedetectOptions { positions_per_frame: 4, threshold: 1.5 }));
+    assert_eq!(deaf, 100);
+}
+
+#[test]
+fn confidence_is_there_with_a_calibration_only() {
+    let (mut tracker, picture) = started();
+    answer(tracker.engine_mut(), (2, 2), 0.5, 20.0);
+    assert_eq!(tracker.update(&view(&picture), None).unwrap().confidence, None);
+    let good = ScoreCalibration { slope: 4.0, bias: -2.0 };
+    tracker.set_calibration(Some(good)).unwrap();
+    let p = tracker.update(&view(&picture), None).unwrap().confidence.unwrap();
+    assert!((p - 0.5).abs() < 1e-6, "{p}");
+    let bad = ScoreCalibration { slope: -1.0, bias: 0.0 };
+    let error = tracker.set_calibration(Some(bad)).unwrap_err();
+    assert_eq!((error.field, tracker.calibration()), ("calibration.slope", Some(good)));
+    // Far out in both directions it stays a probability.
+    assert_eq!((good.probability(-1e30), good.probability(1e30)), (0.0, 1.0));
+}
