@@ -4,7 +4,7 @@
 //! 1. [`frames`]: folders, lists that mix sensors, Y4M on a pipe; [`sequence`]: clips with known
 //!    boxes; [`render`]: the clip the project draws itself.
 //! 2. [`model`]: the embedded bundle or one from a file, and the tracker built from it on the
-//!    engine of [`engine`]'s arguments.
+//!    engine of [`engine`]'s arguments; [`redetect`]: whether a lost target's frame is scanned.
 //! 3. [`track`]: drives a tracker on any engine through a source into outputs.
 //! 4. [`video`]: GIF, page, PNG files, strip; [`metrics`]: figures against known boxes.
 //! 5. [`replay`]: scripted runs, to check the tracker frame by frame.
@@ -20,6 +20,7 @@ pub mod metrics;
 pub mod model;
 pub mod output;
 pub mod picture;
+pub mod redetect;
 pub mod render;
 pub mod replay;
 pub mod sequence;

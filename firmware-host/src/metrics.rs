@@ -93,6 +93,7 @@ mod tests {
             modality,
             bbox,
             score: 1.0,
+            confidence: None,
             state: TrackState::Tracking,
             ms: 0.0,
         }

@@ -39,7 +39,7 @@ pub fn tracker(file: &BundleFile) -> Result<Tracker<AnyEngine>, HostError> {
     tracker_on(file, &EngineChoice::default())
 }
 
-/// A tracker on an engine, with the thresholds the bundle was tuned with.
+/// A tracker on an engine, with the thresholds and the calibration of the bundle.
 ///
 /// # Errors
 /// When the engine is not there on this machine or cannot be built from the bundle's graphs.
@@ -48,9 +48,12 @@ pub fn tracker_on(
     choice: &EngineChoice,
 ) -> Result<Tracker<AnyEngine>, HostError> {
     let bundle = file.bundle()?;
-    let params = bundle.manifest().tracker;
-    Tracker::new(engine(file, &bundle, choice)?, params)
-        .map_err(|source| HostError::Tracker { frame: 0, source: Box::new(source) })
+    let manifest = bundle.manifest();
+    let failed = |source| HostError::Tracker { frame: 0, source: Box::new(source) };
+    let mut tracker =
+        Tracker::new(engine(file, &bundle, choice)?, manifest.tracker).map_err(failed)?;
+    tracker.set_calibration(manifest.calibration).map_err(|e| failed(e.into()))?;
+    Ok(tracker)
 }
 
 /// An engine for a bundle.

@@ -8,7 +8,7 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
-use tsda_runtime::{BBox, Engine, FrameView, Modality, TrackError, TrackState, Tracker};
+use tsda_runtime::{BBox, Engine, FrameView, Modality, Track, TrackError, TrackState, Tracker};
 
 /// What is known about one frame after it was tracked.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,6 +23,9 @@ pub struct Step {
     pub bbox: BBox,
     /// Highest score of the map, about 1 on the target; 1 in the first frame.
     pub score: f32,
+    /// Probability that the box is right, when the tracker knows a calibration; 1 in the first
+    /// frame.
+    pub confidence: Option<f32>,
     /// How far the box can be relied on.
     pub state: TrackState,
     /// Milliseconds inside the tracker.
@@ -124,7 +127,8 @@ impl Run<'_> {
             }
             e => HostError::Tracker { frame: frame.index, source: Box::new(e) },
         })?;
-        Ok(step(frame, self.init, 1.0, TrackState::Tracking, start))
+        let sure = tracker.calibration().map(|_| 1.0);
+        Ok(step(frame, self.init, (1.0, sure), TrackState::Tracking, start))
     }
 }
 
@@ -138,8 +142,9 @@ fn next<E: Engine>(
     let start = Instant::now();
     let now = (frame.view.width(), frame.view.height());
     follow_size(tracker, before, size.unwrap_or(now), now).map_err(failed)?;
-    let track = tracker.update(&frame.view, Some(frame.modality)).map_err(failed)?;
-    Ok(step(frame, track.bbox, track.score, track.state, start))
+    let Track { bbox, score, confidence, state, .. } =
+        tracker.update(&frame.view, Some(frame.modality)).map_err(failed)?;
+    Ok(step(frame, bbox, (score, confidence), state, start))
 }
 
 /// Scales the target along when frames change their size: both sensors are taken to see the same
@@ -157,13 +162,20 @@ pub(crate) fn follow_size<E: Engine>(
     tracker.set_box(BBox::new(last.x * kx, last.y * ky, last.w * kx, last.h * ky))
 }
 
-fn step(frame: &Frame<'_>, bbox: BBox, score: f32, state: TrackState, start: Instant) -> Step {
+fn step(
+    frame: &Frame<'_>,
+    bbox: BBox,
+    (score, confidence): (f32, Option<f32>),
+    state: TrackState,
+    start: Instant,
+) -> Step {
     Step {
         frame: frame.index,
         name: frame.name.to_owned(),
         modality: frame.modality,
         bbox,
         score,
+        confidence,
         state,
         ms: start.elapsed().as_secs_f32() * 1e3,
     }
@@ -208,6 +220,8 @@ struct JsonStep<'a> {
     #[serde(rename = "box")]
     bbox: [f32; 4],
     score: f32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    confidence: Option<f32>,
     state: TrackState,
     ms: f32,
 }
@@ -235,6 +249,7 @@ impl Sink for JsonLines {
             modality: step.modality,
             bbox: [b.x, b.y, b.w, b.h],
             score: step.score,
+            confidence: step.confidence,
             state: step.state,
             ms: step.ms,
         };

@@ -23,6 +23,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<u8, HostError> {
     let bundle = model::load(args.bundle.as_deref())?;
     let choice = args.engine.choice()?;
     let mut tracker = model::tracker_on(&bundle, &choice)?;
+    args.redetect.apply(&mut tracker)?;
     let switching = args.switch_every.map_or(Switching::Middle, |n| Switching::Every(n as usize));
     let (mut source, truth, what) = open(args, switching)?;
     let first = truth.first().copied().flatten().ok_or_else(|| HostError::Init {

@@ -1,6 +1,8 @@
 //! The command line: what was typed ([`Cli`]) and what it does ([`execute`]).
 
 #[cfg(feature = "eval")]
+mod calibrate;
+#[cfg(feature = "eval")]
 mod compare;
 #[cfg(feature = "eval")]
 mod data_check;
@@ -10,6 +12,8 @@ mod devices;
 #[cfg(feature = "eval")]
 mod eval;
 mod info;
+#[cfg(feature = "eval")]
+mod presence;
 mod render;
 mod replay;
 #[cfg(feature = "eval")]
@@ -32,6 +36,7 @@ pub use trax::TraxArgs;
 
 use crate::engine::EngineArgs;
 use crate::error::HostError;
+use crate::redetect::RedetectArgs;
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
@@ -86,6 +91,12 @@ pub enum Command {
     /// Write results as one self-contained page: curves, tables, failures in pictures, model card
     #[cfg(feature = "eval")]
     Report(ReportArgs),
+    /// Measure whether a tracker knows that its target is gone, and how soon it finds it again
+    #[cfg(feature = "eval")]
+    Presence(presence::PresenceArgs),
+    /// Fit the map from score to probability on labelled sequences and store it in a bundle
+    #[cfg(feature = "eval")]
+    Calibrate(calibrate::CalibrateArgs),
     /// List V4L2 cameras and their formats
     #[cfg(feature = "camera")]
     Devices,
@@ -113,6 +124,9 @@ pub struct DemoArgs {
     /// Where the network runs
     #[command(flatten)]
     pub engine: EngineArgs,
+    /// Looking for a lost target
+    #[command(flatten)]
+    pub redetect: RedetectArgs,
 }
 
 /// Arguments of `tsda track`.
@@ -147,6 +161,9 @@ pub struct TrackArgs {
     /// Where the network runs
     #[command(flatten)]
     pub engine: EngineArgs,
+    /// Looking for a lost target
+    #[command(flatten)]
+    pub redetect: RedetectArgs,
 }
 
 /// Arguments of `tsda info`.
@@ -253,6 +270,10 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Compare(args) => compare::run(args),
         #[cfg(feature = "eval")]
         Command::Report(args) => report::run(args),
+        #[cfg(feature = "eval")]
+        Command::Presence(args) => presence::run(args),
+        #[cfg(feature = "eval")]
+        Command::Calibrate(args) => calibrate::run(args),
         #[cfg(feature = "camera")]
         Command::Devices => devices::run(),
     }

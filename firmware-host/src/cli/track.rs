@@ -19,6 +19,7 @@ pub(super) fn run(args: &TrackArgs) -> Result<u8, HostError> {
     let truth = args.truth.as_deref().map(read_boxes).transpose()?.unwrap_or_default();
     let bundle = model::load(args.bundle.as_deref())?;
     let mut tracker = model::tracker_on(&bundle, &args.engine.choice()?)?;
+    args.redetect.apply(&mut tracker)?;
 
     let total = source.len_hint();
     let mut sinks: Vec<Box<dyn Sink>> = vec![Box::new(BoxesFile::create(&args.out)?)];

@@ -3,6 +3,7 @@
 use crate::engine::EngineArgs;
 use crate::error::{EXIT_OK, HostError, one_line};
 use crate::model;
+use crate::redetect::RedetectArgs;
 use crate::trax::{Channels, Connection, End, Options, SensorPolicy, Version, give_up, serve};
 use clap::Args;
 use std::io::{Write, stderr};
@@ -26,6 +27,9 @@ pub struct TraxArgs {
     /// What the bundle runs on
     #[command(flatten)]
     pub engine: EngineArgs,
+    /// Looking for a lost target
+    #[command(flatten)]
+    pub redetect: RedetectArgs,
 }
 
 pub(super) fn run(args: &TraxArgs) -> Result<u8, HostError> {
@@ -33,7 +37,8 @@ pub(super) fn run(args: &TraxArgs) -> Result<u8, HostError> {
     let prepared = options(args).and_then(|mut options| {
         // Before hello: clients give a tracker little time to answer a frame.
         let bundle = model::load(args.bundle.as_deref())?;
-        let tracker = model::tracker_on(&bundle, &args.engine.choice()?)?;
+        let mut tracker = model::tracker_on(&bundle, &args.engine.choice()?)?;
+        args.redetect.apply(&mut tracker)?;
         options.description = bundle.path().display().to_string();
         Ok((options, tracker))
     });

@@ -31,11 +31,14 @@ pub struct ClipConfig {
     pub frames: usize,
     /// Seed of every texture and of the noise.
     pub seed: u32,
+    /// Whether a screen stands in the target's way: it vanishes after a fifth of the clip and is back
+    /// for the last fifth, somewhere else in the picture.
+    pub screen: bool,
 }
 
 impl Default for ClipConfig {
     fn default() -> Self {
-        Self { width: 320, height: 240, frames: 96, seed: 7 }
+        Self { width: 320, height: 240, frames: 96, seed: 7, screen: false }
     }
 }
 
@@ -144,6 +147,16 @@ impl Clip {
         self.target.bbox(&self.camera(t), t * ClipConfig::STORY)
     }
 
+    /// Visible share of the target in `frame`, in `[0, 1]`: 1 but behind the screen.
+    pub fn visible(&self, frame: usize) -> f32 {
+        if !self.config.screen {
+            return 1.0;
+        }
+        let (left, right) = scenery::screen_sides(&self.camera(self.progress(frame)));
+        let b = self.truth(frame);
+        1.0 - ((b.right().min(right) - b.x.max(left)) / b.w).clamp(0.0, 1.0)
+    }
+
     /// Draws `frame` (0-based) as this sensor sees it: 3 channels for RGB, 1 for thermal.
     pub fn render(&self, frame: usize, modality: Modality, out: &mut Picture) {
         let t = self.progress(frame);
@@ -170,6 +183,9 @@ impl Clip {
             walker.paint(c, &camera, &light, seconds);
         }
         scenery::post(c, &camera, &light, (0.62, 8.0), (2.3, 0.045), (0.26, 0.26));
+        if self.config.screen {
+            scenery::screen(c, &camera, &light, seed);
+        }
         match modality {
             Modality::Rgb => sensor::visible(c, frame as u32, seed, out),
             Modality::Thermal => sensor::thermal(c, frame as u32, seed, out),

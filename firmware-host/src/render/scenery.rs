@@ -216,6 +216,35 @@ pub(super) fn post(
     });
 }
 
+/// The screen: distance, left and right side and upper edge in metres. Nearer than any walker, and
+/// higher than they are in the picture.
+const SCREEN: (f32, f32, f32, f32) = (8.6, -1.63, 1.03, 2.45);
+
+/// Screen columns between which nothing behind the screen is seen.
+pub(super) fn screen_sides(camera: &Camera) -> (f32, f32) {
+    let (z, left, right, _) = SCREEN;
+    (camera.project(left, 0.0, z).0, camera.project(right, 0.0, z).0)
+}
+
+/// A boarded fence across the way, as warm as the air.
+pub(super) fn screen(canvas: &mut Canvas, camera: &Camera, light: &Light, seed: u32) {
+    let (z, left, right, tall) = SCREEN;
+    let s = camera.scale(z);
+    let (x0, top) = camera.project(left, tall, z);
+    let (x1, bottom) = camera.project(right, 0.0, z);
+    canvas.fill((x0 - 1.0, top - 1.0, x1 + 1.0, bottom + 1.0), |sx, sy| {
+        let (px, py) = ((sx - camera.centre.0) / s, camera.height - (sy - camera.centre.1) / s);
+        let inside = (px - left).min(right - px).min(tall - py).min(py);
+        let board = (px * 6.0) - libm::floorf(px * 6.0);
+        let gap = if board < 0.06 { 0.55 } else { 1.0 };
+        let grain = noise::octaves(px * 14.0, py * 2.5, (0.3, 0.3), 3, seed ^ 0x9700);
+        let tone = gap * (0.26 + 0.16 * (grain - 0.5));
+        let heat = 0.33 + 0.05 * (grain - 0.5);
+        let colour = [tone, tone * 0.93, tone * 0.82];
+        (inside * s + 0.5, light.shade(colour, heat, (px, z)))
+    });
+}
+
 /// The street lamps with their light.
 pub(super) fn lamps(canvas: &mut Canvas, camera: &Camera, light: &Light) {
     for place in LAMPS {

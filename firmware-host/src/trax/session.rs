@@ -378,7 +378,7 @@ impl<R: Read, W: Write, F: Follow> Session<'_, R, W, F> {
         self.target =
             Some(Target { bbox: track.bbox, size, reference, frame: number + 1, ..target });
         let bbox = scaled(track.bbox, size, reference);
-        self.answer(bbox, track.score, track.state, seen.modality)
+        self.answer(bbox, track.confidence.unwrap_or(track.score), track.state, seen.modality)
     }
 
     /// Decodes what the policy wants to see.
@@ -425,7 +425,7 @@ impl<R: Read, W: Write, F: Follow> Session<'_, R, W, F> {
     fn answer(
         &mut self,
         b: BBox,
-        score: f32,
+        confidence: f32,
         state: TrackState,
         modality: Modality,
     ) -> Result<(), TraxError> {
@@ -433,7 +433,7 @@ impl<R: Read, W: Write, F: Follow> Session<'_, R, W, F> {
         let region = format!("{:.4},{:.4},{:.4},{:.4}", b.x, b.y, b.w, b.h);
         let message = Message::new(Kind::State)
             .arg(region)
-            .with("confidence", format!("{:.6}", score.clamp(0.0, 1.0)))
+            .with("confidence", format!("{:.6}", confidence.clamp(0.0, 1.0)))
             .with("state", state.as_str())
             .with("modality", modality.as_str());
         self.output.send(&message)

@@ -10,6 +10,7 @@ fn step(frame: usize, modality: Modality) -> Step {
         modality,
         bbox: BBox::new(20.0, 30.0, 40.0, 50.0),
         score: 0.8,
+        confidence: None,
         state: TrackState::Tracking,
         ms: 1.0,
     }

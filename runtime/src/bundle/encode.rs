@@ -42,8 +42,8 @@ pub fn encode(
         }
         room = encoded.len();
     };
-    let head = header(&encoded)
-        .ok_or_else(|| EncodeError::Manifest("it is longer than 4 GiB".into()))?;
+    let head =
+        header(&encoded).ok_or_else(|| EncodeError::Manifest("it is longer than 4 GiB".into()))?;
     let mut bytes = head.to_vec();
     bytes.extend_from_slice(&encoded);
     for (entry, (_, body)) in manifest.sections.iter().zip(sections) {

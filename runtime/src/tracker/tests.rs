@@ -408,7 +408,8 @@ fn a_target_that_returns_elsewhere_is_found_by_the_scan_only() {
     println!("frames to find: {slow} with 1 position per frame, {fast} with 4");
     assert!(slow < 40 && fast <= slow.div_ceil(4));
     // Above what the target scores: never.
-    let (deaf, _) = frames_to_find(Some(RedetectOptions { positions_per_frame: 4, threshold: 1.5 }));
+    let (deaf, _) =
+        frames_to_find(Some(RedetectOptions { positions_per_frame: 4, threshold: 1.5 }));
     assert_eq!(deaf, 100);
 }
 

@@ -10,6 +10,8 @@
 //!   of an earlier run and goes on past failures; [`run_summary`] puts it all into files.
 //! * [`metrics`]: SR@0.5, success AUC, PR@20, normalised precision, mean IoU; the same by the rules of
 //!   each benchmark's toolkit; time to recover after a sensor switch.
+//! * [`observe()`], [`presence()`], [`calibrate()`]: whether a tracker knows that its target is gone and
+//!   finds it again; scores turned into probabilities.
 //! * [`truth`], [`results`], [`attributes`], [`compare`]: results of any tracker, read from text,
 //!   scored against any truth and put side by side in a [`report_data::ReportData`].
 //! * [`baselines`]: a static box and template matching, what a tracker has to beat.
@@ -45,13 +47,16 @@
 pub mod attributes;
 pub mod baselines;
 pub mod boxes;
+pub mod calibrate;
 pub mod compare;
 pub mod dataset;
 pub mod distribution;
 pub mod evaluate;
 pub mod fingerprint;
 pub mod metrics;
+pub mod observe;
 pub mod otb;
+pub mod presence;
 pub mod protocol;
 pub mod pseudo;
 pub mod report;
@@ -65,5 +70,8 @@ pub mod summary;
 pub mod tables;
 pub mod truth;
 
+pub use calibrate::calibrate;
 pub use evaluate::{Evaluation, Options, Progress, evaluate, evaluate_all};
+pub use observe::observe;
+pub use presence::presence;
 pub use runtime::RuntimeTracker;

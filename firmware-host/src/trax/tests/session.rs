@@ -14,6 +14,7 @@ struct Fake {
     /// Calls in order: `init rgb 12x8 1,2,3,4`.
     calls: Vec<String>,
     score: f32,
+    confidence: Option<f32>,
     state: Option<TrackState>,
     frame: u64,
 }
@@ -43,11 +44,13 @@ impl Follow for Fake {
         Ok(Track {
             bbox,
             score: self.score,
+            confidence: self.confidence,
             state: self.state.unwrap_or(TrackState::Tracking),
             flag: Flag::Normal,
             wrote_memory: false,
             frame: self.frame,
             missing: 0,
+            redetected: false,
         })
     }
 

@@ -1,0 +1,66 @@
+//! Whether the frame is scanned for a lost target: arguments shared by the commands that track.
+
+use crate::error::HostError;
+use clap::Args;
+use tsda_runtime::{RedetectOptions, Tracker};
+
+/// `--scan-when-lost` and `--scan-threshold`.
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub struct RedetectArgs {
+    /// Look over the whole frame for a target that is lost, N search areas more per frame (the cost
+    /// of a frame is that of N + 1 then) [default when given without N: 2]
+    #[arg(long, value_name = "N", num_args = 0..=1, require_equals = true,
+        default_missing_value = "2", value_parser = clap::value_parser!(u8).range(1..))]
+    pub scan_when_lost: Option<u8>,
+    /// Score above which a find of the scan counts [default: 0.6]
+    #[arg(long, value_name = "SCORE", requires = "scan_when_lost")]
+    pub scan_threshold: Option<f32>,
+}
+
+impl RedetectArgs {
+    /// What was chosen; `None`: look only where the target was last seen.
+    pub fn options(&self) -> Option<RedetectOptions> {
+        let defaults = RedetectOptions::default();
+        self.scan_when_lost.map(|positions_per_frame| RedetectOptions {
+            positions_per_frame,
+            threshold: self.scan_threshold.unwrap_or(defaults.threshold),
+        })
+    }
+
+    /// Sets a tracker up.
+    ///
+    /// # Errors
+    /// When the threshold is out of range.
+    pub fn apply<E>(&self, tracker: &mut Tracker<E>) -> Result<(), HostError> {
+        tracker.set_redetection(self.options()).map_err(|e| HostError::Argument {
+            what: "--scan-threshold".into(),
+            reason: e.to_string(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Program {
+        #[command(flatten)]
+        redetect: RedetectArgs,
+    }
+
+    #[test]
+    fn the_scan_is_off_unless_asked_for() {
+        let parse = |args: &[&str]| {
+            let args = ["program"].iter().chain(args);
+            Program::try_parse_from(args).map(|p| p.redetect.options())
+        };
+        assert_eq!(parse(&[]).expect("nothing"), None);
+        assert_eq!(parse(&["--scan-when-lost"]).expect("alone"), Some(RedetectOptions::default()));
+        let both = parse(&["--scan-when-lost=5", "--scan-threshold", "0.8"]).expect("both");
+        assert_eq!(both, Some(RedetectOptions { positions_per_frame: 5, threshold: 0.8 }));
+        assert!(parse(&["--scan-threshold", "0.8"]).is_err());
+        assert!(parse(&["--scan-when-lost=0"]).is_err());
+    }
+}
