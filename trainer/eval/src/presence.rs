@@ -87,7 +87,8 @@ pub struct PresenceSummary {
     pub false_report_rate: Option<f64>,
     /// Share of visible frames reported as `Searching` or `Lost`.
     pub missed_rate: Option<f64>,
-    /// From the first absent frame to the first reported as `Searching` or `Lost`.
+    /// From the first absent frame to the first reported as `Searching` or `Lost`, within the absence.
+    /// Absences before which the tracker already did so are left out, here and in `lost`.
     pub noticed: Delay,
     /// From the first absent frame to the first reported as `Lost`; within the absence.
     pub lost: Delay,
@@ -121,8 +122,14 @@ pub fn presence(runs: &[Observation]) -> PresenceSummary {
         }
         for (gone, back, end) in absences(frames) {
             let absence = &frames[gone..back];
-            noticed.push(absence.iter().position(|f| !reported(f)));
-            lost.push(absence.iter().position(|f| f.state == TrackState::Lost));
+            // A tracker that was there before the target went has nothing to notice.
+            let before = gone.checked_sub(1).and_then(|i| frames.get(i));
+            if before.is_none_or(reported) {
+                noticed.push(absence.iter().position(|f| !reported(f)));
+            }
+            if before.is_none_or(|f| f.state != TrackState::Lost) {
+                lost.push(absence.iter().position(|f| f.state == TrackState::Lost));
+            }
             if back < frames.len() {
                 let found = frames[back..end].iter().position(found);
                 // The scan may have found it while it was still half hidden; then the tracker just
@@ -271,6 +278,14 @@ mod tests {
         assert_eq!(s.lost, Delay::default());
         assert_eq!(presence(&[]), PresenceSummary::default());
         assert_eq!(presence(&[run("", "", "")]).visible, 0);
+    }
+
+    #[test]
+    fn who_was_lost_before_the_target_went_is_not_credited() {
+        let s = presence(&[run("vvaav", "TllTT", "90009"), run("vvaav", "TssLT", "90009")]);
+        assert_eq!(s.noticed.changes, 0);
+        assert_eq!((s.lost.changes, s.lost.mean_frames), (1, Some(1.0)));
+        assert_eq!(s.redetected.came, 2);
     }
 
     #[test]

@@ -300,6 +300,10 @@ fn answers_say_how_sure_they_are() {
         let played = play_with(&version(4), &mut fake, text.as_bytes());
         assert!(played.lines[2].contains(want), "{}", played.lines[2]);
     }
+    // A probability is said in the place of the score.
+    let mut fake = Fake { score: 0.9, confidence: Some(0.625), ..Fake::default() };
+    let played = play_with(&version(4), &mut fake, text.as_bytes());
+    assert!(played.lines[2].contains("\"confidence=0.625000\""), "{}", played.lines[2]);
 }
 
 #[test]
