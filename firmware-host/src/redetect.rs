@@ -12,7 +12,7 @@ pub struct RedetectArgs {
     #[arg(long, value_name = "N", num_args = 0..=1, require_equals = true,
         default_missing_value = "2", value_parser = clap::value_parser!(u8).range(1..))]
     pub scan_when_lost: Option<u8>,
-    /// Score above which a find of the scan counts [default: 0.6]
+    /// Score above which a find of the scan counts [default: 0.7]
     #[arg(long, value_name = "SCORE", requires = "scan_when_lost")]
     pub scan_threshold: Option<f32>,
 }
