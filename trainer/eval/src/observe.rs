@@ -40,7 +40,11 @@ pub fn observe<E: Engine>(
             source,
         };
         let modality = protocol.modality(at - start);
-        let picture = sequence.picture(at, modality)?;
+        let picture = sequence.picture(at, modality).map_err(|source| EvalError::Frame {
+            sequence: id.to_owned(),
+            frame: at,
+            source,
+        })?;
         let view = picture.view().map_err(|e| failed(TrackerError::new(e)))?;
         let (predicted, score, state, redetected) = if at == start {
             tracker.init(&view, first, Some(modality)).map_err(|e| failed(TrackerError::new(e)))?;
