@@ -154,19 +154,19 @@ fn what_fails_is_listed_and_the_rest_is_kept() {
     let dir = tempfile::tempdir().expect("temp");
     lasher(dir.path(), &["a", "b", "c"]);
     let set = dir.path().join("set/TestingSet/testingset");
-    fs::write(set.join("a/infrared/00004.png"), "no picture").expect("broken");
+    fs::write(set.join("a/infrared/00002.png"), "no picture").expect("broken");
     fs::write(set.join("c/visible.txt"), "40,36,20,20\n40,36,x,20\n").expect("broken");
     let output = eval(dir.path(), &SWITCH);
     let text = said(&output);
     assert_eq!(output.status.code(), Some(1), "{text}");
     for words in
-        ["sequence a, frame 4", "infrared/00004.png", "c/visible.txt, line 2", "2 sequences failed"]
+        ["sequence a, frame 2", "infrared/00002.png", "c/visible.txt, line 2", "2 sequences failed"]
     {
         assert!(text.contains(words), "no {words} in {text}");
     }
     let summary = json(&dir.path().join("out/summary.json"));
     let failed = &summary["protocols"]["switch:3"]["failed"];
-    assert_eq!((&failed[0]["sequence"], &failed[0]["frame"]), (&"a".into(), &4.into()));
+    assert_eq!((&failed[0]["sequence"], &failed[0]["frame"]), (&"a".into(), &2.into()));
     assert_eq!((&summary["broken"][0]["line"], &summary["failures"]), (&2.into(), &2.into()));
     assert_eq!(summary["protocols"]["switch:3"]["sequences"], 1);
 

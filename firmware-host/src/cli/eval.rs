@@ -158,8 +158,10 @@ pub(super) fn run(args: &EvalArgs) -> Result<u8, HostError> {
     let text = format!("{table}\n{}", tables::markdown(&report));
     write_file(&args.out.join("summary.md"), text.as_bytes())?;
     print!("{table}");
-    let trackers = entries.iter().map(|e| e.name.as_str());
-    super::report::of_evaluation(&data, &args.out, trackers, &protocols, &bundle)?;
+    if summary.any_result() {
+        let trackers = entries.iter().map(|e| e.name.as_str());
+        super::report::of_evaluation(&data, &args.out, trackers, &protocols, &options, &bundle)?;
+    }
     Ok(conclude(&summary, &args.out))
 }
 

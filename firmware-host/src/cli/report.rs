@@ -205,6 +205,7 @@ pub(super) fn of_evaluation<'a>(
     folder: &Path,
     trackers: impl IntoIterator<Item = &'a str>,
     protocols: &[Protocol],
+    options: &DataOptions,
     bundle: &BundleFile,
 ) -> Result<(), HostError> {
     let runs = find_runs(folder, None).map_err(|e| unusable("--out", &e))?;
@@ -220,10 +221,10 @@ pub(super) fn of_evaluation<'a>(
     }
     let source = Source {
         dataset: Some(dataset),
-        truth: &|protocol| Ok(TruthSet::of_dataset(dataset, Convention::Tsda, protocol)),
+        truth: &|protocol| Ok(TruthSet::of_dataset(dataset, options.convention, protocol)),
         attributes: None,
         compare: CompareOptions {
-            data: DataOptions { frames: true, ..DataOptions::default() },
+            data: DataOptions { frames: true, ..*options },
             layout: Layout::Xywh,
             partial: true,
         },

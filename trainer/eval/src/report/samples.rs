@@ -7,6 +7,8 @@
 //! | `<sequence>_score.txt`, `_scores.txt`, `_confidence.txt`, `_confidence.value` | the tracker's score |
 //! | `<sequence>_time.txt`, `_times.txt`, `_time.value` | seconds |
 //!
+//! Without those, `<sequence>.json` as `tsda eval` writes it ([`Record`]) gives both.
+//!
 //! An empty line or NaN says nothing about its frame; the line of the initial frame may be missing.
 //! Everything is optional: what is absent is left out of the report.
 
@@ -17,8 +19,10 @@ use crate::dataset::DatasetError;
 use crate::metrics::recovery::RECOVERED_IOU;
 use crate::report_data::TrackerData;
 use crate::results::ResultFolder;
+use crate::store::Record;
 
 const SCORES: [&str; 4] = ["_score.txt", "_scores.txt", "_confidence.txt", "_confidence.value"];
+const RECORD: [&str; 1] = [".json"];
 const TIMES: [&str; 3] = ["_time.txt", "_times.txt", "_time.value"];
 
 /// Single frames of one tracker under one protocol; the initial frames are left out.
@@ -47,20 +51,19 @@ impl Samples {
         for (name, data) in &tracker.sequences {
             // Overlaps are those of the first repetition.
             let Some(result) = folder.files(&prefix, name).into_iter().next() else { continue };
-            if let Some(path) = beside(&result, &SCORES)
+            let (scores, times) = (beside(&result, &SCORES), beside(&result, &TIMES));
+            if scores.is_none() && times.is_none() {
+                if let Some(path) = beside(&result, &RECORD) {
+                    samples.add_record(&path, &data.iou)?;
+                }
+                continue;
+            }
+            if let Some(path) = scores
                 && !data.iou.is_empty()
             {
-                let scores = numbers(&path, data.iou.len())?;
-                for (score, iou) in scores.iter().zip(&data.iou).skip(1) {
-                    let Some(score) = score else { continue };
-                    match iou {
-                        Some(v) if *v >= RECOVERED_IOU => samples.right.push(*score),
-                        Some(_) => samples.wrong.push(*score),
-                        None => samples.absent.push(*score),
-                    }
-                }
+                samples.add_scores(&numbers(&path, data.iou.len())?, &data.iou);
             }
-            if let Some(path) = beside(&result, &TIMES) {
+            if let Some(path) = times {
                 let frames = if data.iou.is_empty() { line_count(&path)? } else { data.iou.len() };
                 let seconds = numbers(&path, frames)?;
                 let times = seconds.iter().skip(1).flatten().filter(|s| **s >= 0.0);
@@ -68,6 +71,37 @@ impl Samples {
             }
         }
         Ok(samples)
+    }
+
+    /// One score per frame with its overlap; the initial frame is left out.
+    fn add_scores(&mut self, scores: &[Option<f64>], iou: &[Option<f64>]) {
+        for (score, iou) in scores.iter().zip(iou).skip(1) {
+            let Some(score) = score else { continue };
+            match iou {
+                Some(v) if *v >= RECOVERED_IOU => self.right.push(*score),
+                Some(_) => self.wrong.push(*score),
+                None => self.absent.push(*score),
+            }
+        }
+    }
+
+    fn add_record(&mut self, path: &Path, iou: &[Option<f64>]) -> Result<(), DatasetError> {
+        let wrong = |reason: String| DatasetError::Format { path: path.into(), line: None, reason };
+        let record: Record = serde_json::from_str(&read_text(path)?)
+            .map_err(|e| wrong(format!("not a record of tsda eval: {e}")))?;
+        if !iou.is_empty() {
+            // Overlaps may count from the sequence's first frame, records count from the start.
+            let (frames, before) = (iou.len(), iou.len().saturating_sub(record.scores.len()));
+            if record.scores.len() > frames || (before != 0 && before != record.start) {
+                let scores = record.scores.len();
+                return Err(wrong(format!("{scores} scores for results of {frames} frames")));
+            }
+            let scores: Vec<_> = record.scores.iter().map(|s| s.map(f64::from)).collect();
+            self.add_scores(&scores, &iou[before..]);
+        }
+        let times = record.milliseconds.iter().skip(1).map(|ms| f64::from(*ms));
+        self.milliseconds.extend(times.filter(|ms| *ms >= 0.0));
+        Ok(())
     }
 
     /// Probability that a right box has a higher score than a wrong one (area under the ROC curve,
