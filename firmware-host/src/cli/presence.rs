@@ -279,7 +279,7 @@ mod tests {
 
     #[test]
     fn a_seed_is_asked_for() {
-        let e = open("rendered:x").err().expect("no number").to_string();
+        let e = open("rendered:x").expect_err("no number").to_string();
         assert!(e.contains("rendered:7"), "{e}");
     }
 }

@@ -106,7 +106,8 @@ impl Axis {
         // Pixel centres: the middle of a picture of one pixel is at 0.
         let middle = (image - 1.0) * 0.5;
         let free = image - size;
-        if !(free > 0.0) {
+        // Also for a size that is no number.
+        if free.is_nan() || free <= 0.0 {
             return Self { count: 1, first: middle, step: 0.0 };
         }
         // Areas narrower than a few pixels would make a grid without use and without end.

@@ -78,6 +78,7 @@ pub struct Extent {
 
 /// A target that could not be tracked to its end.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Default)]
 pub struct Failure {
     /// The sequence, or `sequence#target`; empty when it could not even be opened.
     pub sequence: String,
@@ -119,11 +120,6 @@ impl Failure {
     }
 }
 
-impl Default for Failure {
-    fn default() -> Self {
-        Self { sequence: String::new(), frame: None, path: None, line: None, reason: String::new() }
-    }
-}
 
 /// A sequence or target that a protocol cannot run on.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
