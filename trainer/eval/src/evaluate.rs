@@ -77,8 +77,7 @@ pub struct Extent {
 }
 
 /// A target that could not be tracked to its end.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[derive(Default)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Failure {
     /// The sequence, or `sequence#target`; empty when it could not even be opened.
     pub sequence: String,
