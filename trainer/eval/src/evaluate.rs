@@ -119,7 +119,6 @@ impl Failure {
     }
 }
 
-
 /// A sequence or target that a protocol cannot run on.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Skipped {
