@@ -75,12 +75,6 @@ impl EngineKind {
     /// # Errors
     /// When it is not compiled in, not installed, or does not take the network.
     pub fn open(self, net: &TrackerNet) -> Result<Vec<Box<dyn Backend>>, GoldenError> {
-        let absent = |feature: &str| {
-            Err(GoldenError::Unavailable(format!(
-                "{} is not part of this program: build it with `--features {feature}`",
-                self.name()
-            )))
-        };
         match self {
             Self::Burn => Ok(on_burn(net, ["burn", "burn, re-arranged"])),
             #[cfg(feature = "wgpu")]
@@ -89,7 +83,7 @@ impl EngineKind {
                 Ok(on_burn(&net, ["wgpu", "wgpu, re-arranged"]))
             }
             #[cfg(not(feature = "wgpu"))]
-            Self::Wgpu => absent("wgpu"),
+            Self::Wgpu => self.absent("wgpu"),
             Self::Native => on_engine("native", net, NativeEngine::from_bundle, graphs::native),
             Self::Tract => on_engine("tract", net, TractEngine::from_bundle, graphs::tract),
             #[cfg(feature = "ort")]
@@ -100,8 +94,16 @@ impl EngineKind {
                 graphs::ort,
             ),
             #[cfg(not(feature = "ort"))]
-            Self::Ort => absent("ort"),
+            Self::Ort => self.absent("ort"),
         }
+    }
+
+    #[cfg(not(all(feature = "wgpu", feature = "ort")))]
+    fn absent(self, feature: &str) -> Result<Vec<Box<dyn Backend>>, GoldenError> {
+        Err(GoldenError::Unavailable(format!(
+            "{} is not part of this program: build it with `--features {feature}`",
+            self.name()
+        )))
     }
 }
 
