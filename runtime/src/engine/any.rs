@@ -177,17 +177,14 @@ impl EngineChoice {
     }
 }
 
-/// Most threads the native engine takes.
-#[cfg(feature = "native")]
-const MOST_THREADS: usize = 64;
-
 /// A number of threads as typed: 0 for one per core.
 #[cfg(feature = "native")]
 fn native_threads(threads: usize) -> Result<usize, String> {
+    const MOST: usize = NativeOptions::MAX_THREADS;
     match threads {
-        0 => Ok(std::thread::available_parallelism().map_or(1, usize::from).min(MOST_THREADS)),
-        1..=MOST_THREADS => Ok(threads),
-        _ => Err(format!("{threads} threads; at most {MOST_THREADS} are possible")),
+        0 => Ok(std::thread::available_parallelism().map_or(1, usize::from).min(MOST)),
+        1..=MOST => Ok(threads),
+        _ => Err(format!("{threads} threads; at most {MOST} are possible")),
     }
 }
 

@@ -28,8 +28,6 @@ pub use plan::ProgramSummary;
 pub use session::GraphSession;
 
 const NAME: &str = "native";
-/// Most threads of one engine.
-const MAX_THREADS: usize = 64;
 
 /// How to run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,6 +38,11 @@ pub struct NativeOptions {
     pub pin: bool,
     /// Instruction set; `None` takes the best one of this processor.
     pub isa: Option<Isa>,
+}
+
+impl NativeOptions {
+    /// Most threads of one engine.
+    pub const MAX_THREADS: usize = 64;
 }
 
 impl Default for NativeOptions {
@@ -148,8 +151,9 @@ impl NativeEngine {
     /// number of threads is not 1 to 64.
     pub fn with_options(bundle: &Bundle<'_>, options: NativeOptions) -> Result<Self, EngineError> {
         let threads = options.threads;
-        if !(1..=MAX_THREADS).contains(&threads) {
-            let message = format_args!("{threads} threads; 1 to {MAX_THREADS} are possible");
+        let most = NativeOptions::MAX_THREADS;
+        if !(1..=most).contains(&threads) {
+            let message = format_args!("{threads} threads; 1 to {most} are possible");
             return Err(error(Stage::Load, message));
         }
         let isa = options.isa.unwrap_or_else(Isa::best);

@@ -11,6 +11,7 @@
 
 mod card;
 mod failure;
+mod failure_view;
 mod html;
 mod plot;
 mod runs;
@@ -104,7 +105,7 @@ pub fn render(
     for rank in 0..most {
         for (protocol, extra) in extras.iter().enumerate().take(data.protocols.len()) {
             let Some(strip) = extra.strips.get(rank) else { continue };
-            let text = sections::strip(&data.protocols[protocol], strip);
+            let text = failure_view::strip(&data.protocols[protocol], strip);
             if text.len() <= room {
                 room -= text.len();
                 kept.strips[protocol].push(text);

@@ -336,7 +336,7 @@ fn the_page_stays_below_its_limit() {
     let at = |max_bytes| {
         render(&data, &extras, None, &ReportOptions { max_bytes, ..ReportOptions::default() })
     };
-    let strip = sections::strip(&data.protocols[0], &extras[0].strips[0]).len();
+    let strip = failure_view::strip(&data.protocols[0], &extras[0].strips[0]).len();
     let tight = at(whole.len() - strip).unwrap();
     assert!(tight.len() <= whole.len() - strip);
     assert!((1..3 * PICTURES).contains(&pictures(&tight)));
