@@ -330,7 +330,9 @@ fn the_sample_sheet_is_a_picture() {
 
 /// The configuration with alignment in force from step 4 of 20.
 fn aligned() -> String {
-    let config = CONFIG.replace("steps = 6", "steps = 20").replace("= 3", "= 10");
+    let config = CONFIG
+        .replace("steps = 6", "steps = 20")
+        .replace("validate_every = 3", "validate_every = 10");
     config + "[align]\npreset = \"joint\"\nstart_step = 4\nramp_steps = 5\nlr = 2e-3\n"
 }
 
@@ -413,12 +415,13 @@ const ALIGN_FIGURES: [&str; 7] = [
 #[test]
 fn every_row_of_the_ablation_trains_from_the_command_line() {
     let bench = Bench::new();
-    let config = CONFIG.replace("validate_every = 3", "validate_every = 4");
+    let config = CONFIG
+        .replace("validate_every = 3", "validate_every = 4")
+        .replace("validation_samples = 4", "validation_samples = 16");
     bench.config("rows.toml", &config);
     let mut seen = std::collections::BTreeSet::new();
     for row in ["baseline", "cm", "pre-afa", "pre-cfa", "enc-afa", "enc-cfa", "joint"] {
-        let more =
-            ["--align-preset", row, "--align-start", "1", "--steps", "4", "--seed", "3"];
+        let more = ["--align-preset", row, "--align-start", "1", "--steps", "4", "--seed", "3"];
         let weights = bench.trained("rows.toml", row, &more);
         assert!(seen.insert(weights), "{row} trains like another row");
         let entries = log(&bench.path(row));

@@ -52,16 +52,21 @@ PARAMETERS = {
 }
 THERMAL = {"template": [0, 1, 1, 0, 1], "search": [0, 0, 1, 1, 0]}
 
-# stage, weight, reversal, normalise | stage, weight, temperature
+# stage, weight, reversal, normalise | stage, weight, temperature, normalise
 CASES = {
     "pre-afa": (("pre", 0.5, 0.1, False), None),
     "enc-afa": (("encoder", 0.5, 0.1, False), None),
     "pre-afa-normalised": (("pre", 0.5, 0.1, True), None),
-    "pre-cfa": (None, ("pre", 0.1, 0.1)),
-    "enc-cfa": (None, ("encoder", 0.1, 0.1)),
-    "joint": (("pre", 0.3, 0.1, False), ("encoder", 0.1, 0.1)),
-    "both-encoder": (("encoder", 0.7, 1.3, False), ("encoder", 0.2, 0.5)),
+    "pre-cfa": (None, ("pre", 0.1, 0.1, False)),
+    "pre-cfa-normalised": (None, ("pre", 0.1, 0.1, True)),
+    "enc-cfa": (None, ("encoder", 0.1, 0.1, False)),
+    "joint": (("pre", 0.3, 0.1, False), ("encoder", 0.1, 0.1, False)),
+    "both-encoder": (("encoder", 0.7, 1.3, False), ("encoder", 0.2, 0.5, False)),
 }
+
+
+def standardised(x, wanted):
+    return F.layer_norm(x, (D,), eps=1e-8) if wanted else x
 
 
 def mlp(p, name, x):
@@ -77,9 +82,7 @@ def run(adversarial, contrastive):
         stage, weight, reversal, normalise = adversarial
         halves, right = [], 0
         for role in ("template", "search"):
-            d = Reverse.apply(x[f"{stage}.{role}"], reversal)
-            if normalise:
-                d = F.layer_norm(d, (D,), eps=1e-8)
+            d = standardised(Reverse.apply(x[f"{stage}.{role}"], reversal), normalise)
             logits = mlp(p, "discriminator", d)[:, 0]
             label = torch.tensor(THERMAL[role], dtype=torch.float64)
             halves.append(F.binary_cross_entropy_with_logits(logits, label))
@@ -89,8 +92,11 @@ def run(adversarial, contrastive):
         out["discriminator_accuracy"] = right / (2 * B)
         total = total + weight * 0.5 * (halves[0] + halves[1])
     if contrastive:
-        stage, weight, temperature = contrastive
-        t, s = (F.normalize(mlp(p, "projection", x[f"{stage}.{r}"])) for r in ("template", "search"))
+        stage, weight, temperature, normalise = contrastive
+        t, s = (
+            F.normalize(mlp(p, "projection", standardised(x[f"{stage}.{r}"], normalise)))
+            for r in ("template", "search")
+        )
         logits, own = t @ s.T / temperature, torch.arange(B)
         loss = 0.5 * (F.cross_entropy(logits, own) + F.cross_entropy(logits.T, own))
         out["contrastive"] = float(loss)

@@ -12,7 +12,8 @@ fn layers(widths: &[usize], device: &Device) -> Vec<Linear> {
     widths.windows(2).map(|w| linear_layer(w[0], w[1], device)).collect()
 }
 
-fn forward(layers: &[Linear], x: Tensor<2>) -> Tensor<2> {
+fn forward(layers: &[Linear], x: Tensor<2>, normalise: bool) -> Tensor<2> {
+    let x = if normalise { standardised(x) } else { x };
     layers.iter().enumerate().fold(x, |x, (i, layer)| {
         let x = if i == 0 { x } else { relu(x) };
         layer.forward(x)
@@ -29,8 +30,7 @@ pub struct Discriminator {
 impl Discriminator {
     /// Logits `(B, 1)`, positive for thermal, of descriptors `(B, d)`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        let x = if self.normalise { standardised(x) } else { x };
-        forward(&self.layers, x)
+        forward(&self.layers, x, self.normalise)
     }
 }
 
@@ -46,12 +46,13 @@ fn standardised(x: Tensor<2>) -> Tensor<2> {
 #[derive(Module, Debug)]
 pub struct Projection {
     pub(crate) layers: Vec<Linear>,
+    normalise: bool,
 }
 
 impl Projection {
     /// Projections `(B, k)`, of any length, of descriptors `(B, d)`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        forward(&self.layers, x)
+        forward(&self.layers, x, self.normalise)
     }
 }
 
@@ -75,9 +76,10 @@ impl Branches {
             layers: layers(&widths(&b.hidden, 1), device),
             normalise: b.normalise,
         });
-        let projection = config
-            .contrastive()
-            .map(|b| Projection { layers: layers(&widths(&b.hidden, b.dim), device) });
+        let projection = config.contrastive().map(|b| Projection {
+            layers: layers(&widths(&b.hidden, b.dim), device),
+            normalise: b.normalise,
+        });
         let any = discriminator.is_some() || projection.is_some();
         any.then_some(Self { discriminator, projection })
     }

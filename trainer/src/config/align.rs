@@ -81,9 +81,10 @@ impl std::str::FromStr for AlignPreset {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        Self::ALL.into_iter().find(|p| p.name() == name).ok_or_else(|| {
-            format!("one of {} is wanted", Self::ALL.map(Self::name).join(", "))
-        })
+        Self::ALL
+            .into_iter()
+            .find(|p| p.name() == name)
+            .ok_or_else(|| format!("one of {} is wanted", Self::ALL.map(Self::name).join(", ")))
     }
 }
 
@@ -139,6 +140,9 @@ pub struct Contrastive {
     pub hidden: Vec<usize>,
     /// Width of what is compared.
     pub dim: usize,
+    /// As [`Adversarial::normalise`]. Without it, the biases of a fresh projection outweigh
+    /// descriptors of head features, and all projections look alike.
+    pub normalise: bool,
 }
 
 impl Default for Contrastive {
@@ -149,6 +153,7 @@ impl Default for Contrastive {
             temperature: 0.1,
             hidden: vec![256],
             dim: 128,
+            normalise: false,
         }
     }
 }
@@ -195,6 +200,9 @@ pub struct ContrastiveConfig {
     /// See [`Contrastive::dim`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dim: Option<usize>,
+    /// See [`Contrastive::normalise`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub normalise: Option<bool>,
 }
 
 /// The `[align]` table. [`AlignConfig::adversarial`] and [`AlignConfig::contrastive`] say what comes
@@ -262,6 +270,7 @@ impl AlignConfig {
             temperature: table.temperature.unwrap_or(base.temperature),
             hidden: table.hidden.clone().unwrap_or(base.hidden),
             dim: table.dim.unwrap_or(base.dim),
+            normalise: table.normalise.unwrap_or(base.normalise),
         })
     }
 
@@ -294,6 +303,7 @@ impl AlignConfig {
                 temperature: Some(b.temperature),
                 hidden: Some(b.hidden),
                 dim: Some(b.dim),
+                normalise: Some(b.normalise),
             }),
             ..self.clone()
         }

@@ -204,7 +204,8 @@ fn alignment_tables_override_a_preset_or_stand_alone() {
     assert_eq!(e.align.adversarial().unwrap().reversal, 0.1);
     assert!(e.align.contrastive().is_none());
 
-    let text = format!("{MINIMAL}[run]\nsteps = 100\n[align]\nstart_step = 0\n[align.adversarial]\n");
+    let text =
+        format!("{MINIMAL}[run]\nsteps = 100\n[align]\nstart_step = 0\n[align.adversarial]\n");
     let e = parse(&text).unwrap();
     assert!(e.align.is_on() && e.align.contrastive().is_none());
 }

@@ -1,8 +1,8 @@
 //! Range checks of every field, each naming the field as it is written in the file.
 
 use super::{
-    AlignPreset, DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig, ProcessingConfig,
-    RunConfig, SamplerConfig, ScheduleConfig,
+    AlignPreset, DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig,
+    ProcessingConfig, RunConfig, SamplerConfig, ScheduleConfig,
 };
 use tsda_eval::dataset::Split;
 use tsda_runtime::SpecError;
@@ -221,7 +221,8 @@ fn check_align(e: &Experiment) -> Result<(), FieldError> {
     if a.is_on() && start >= total {
         let field = if a.start_step.is_some() { "align.start_step" } else { "align.start_epoch" };
         let value = a.start_step.unwrap_or(a.start_epoch);
-        let want = format!("before the end of the run: alignment would start at step {start} of {total}");
+        let want =
+            format!("before the end of the run: alignment would start at step {start} of {total}");
         let want = want + " (runs counted in steps: set align.start_step or give --align-start)";
         return fail(field, value, &want);
     }

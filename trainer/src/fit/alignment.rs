@@ -31,20 +31,20 @@ impl Alignment {
 
     /// Norms of the gradients by the names they have in logs.
     pub fn gradient_norms(&self, step: &AlignStep) -> Vec<(&'static str, f32)> {
-        [("discriminator_grad_norm", &step.discriminator), ("projection_grad_norm", &step.projection)]
-            .into_iter()
-            .filter_map(|(name, g)| {
-                g.as_ref().map(|g| (name, optim::gradient_norm(&self.branches, g)))
-            })
-            .collect()
+        [
+            ("discriminator_grad_norm", &step.discriminator),
+            ("projection_grad_norm", &step.projection),
+        ]
+        .into_iter()
+        .filter_map(|(name, g)| g.as_ref().map(|g| (name, optim::gradient_norm(&self.branches, g))))
+        .collect()
     }
 
     /// One optimiser step, every branch clipped on its own.
     pub fn update(&mut self, rate: f64, step: AlignStep, clip: f64) {
         for gradients in [step.discriminator, step.projection].into_iter().flatten() {
             let norm = optim::gradient_norm(&self.branches, &gradients);
-            let gradients: GradientsParams =
-                optim::clip(&self.branches, gradients, norm, clip);
+            let gradients: GradientsParams = optim::clip(&self.branches, gradients, norm, clip);
             // Parameters without a gradient, those of the other branch, stay as they are.
             self.branches = self.optimizer.step(rate, self.branches.clone(), gradients);
         }

@@ -5,7 +5,6 @@ use crate::align_report::svg::{Axis, escape, put};
 use crate::checkpoint::write_atomic;
 use crate::config::Experiment;
 use serde_json::Value;
-use std::path::Path;
 
 const WIDTH: f64 = 440.0;
 const HEIGHT: f64 = 250.0;
@@ -124,7 +123,11 @@ fn short(value: f64) -> String {
 }
 
 /// One chart; `start` is a step to mark. `None` without any number.
-fn chart((title, log, event, series): &Chart, entries: &[Value], start: Option<u64>) -> Option<String> {
+fn chart(
+    (title, log, event, series): &Chart,
+    entries: &[Value],
+    start: Option<u64>,
+) -> Option<String> {
     let height = |v: f64| if *log { v.max(1e-12).log10() } else { v };
     let lines: Vec<Line> = series
         .iter()
@@ -149,23 +152,32 @@ fn chart((title, log, event, series): &Chart, entries: &[Value], start: Option<u
     for (value, text) in y.ticks() {
         let text = if *log { short(10f64.powf(value)) } else { text };
         let at = y.place(value);
-        put(&mut svg, format_args!(
-            "<path class=\"grid\" d=\"M{left} {at:.1}H{right}\"/><text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{text}</text>\n",
-            left - 5.0,
-            at + 4.0
-        ));
+        put(
+            &mut svg,
+            format_args!(
+                "<path class=\"grid\" d=\"M{left} {at:.1}H{right}\"/><text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{text}</text>\n",
+                left - 5.0,
+                at + 4.0
+            ),
+        );
     }
     for (value, text) in x.ticks() {
         let at = x.place(value);
-        put(&mut svg, format_args!(
-            "<path class=\"grid\" d=\"M{at:.1} {top}V{bottom}\"/><text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{text}</text>\n",
-            bottom + 16.0
-        ));
+        put(
+            &mut svg,
+            format_args!(
+                "<path class=\"grid\" d=\"M{at:.1} {top}V{bottom}\"/><text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{text}</text>\n",
+                bottom + 16.0
+            ),
+        );
     }
-    put(&mut svg, format_args!(
-        "<text x=\"{right}\" y=\"{}\" text-anchor=\"end\">step</text>\n",
-        HEIGHT - 6.0
-    ));
+    put(
+        &mut svg,
+        format_args!(
+            "<text x=\"{right}\" y=\"{}\" text-anchor=\"end\">step</text>\n",
+            HEIGHT - 6.0
+        ),
+    );
     if let Some(start) = start.map(|s| x.place(s as f64)).filter(|at| (left..=right).contains(at)) {
         put(&mut svg, format_args!("<path class=\"mark\" d=\"M{start:.1} {top}V{bottom}\"/>\n"));
     }
@@ -180,26 +192,33 @@ fn chart((title, log, event, series): &Chart, entries: &[Value], start: Option<u
                 format!("{letter}{:.1} {:.1}", x.place(p.0), y.place(height(p.1)))
             })
             .collect();
-        put(&mut svg, format_args!(
-            "<path class=\"line\" stroke=\"{colour}\" stroke-dasharray=\"{dash}\" d=\"{d}\"><title>{}</title></path>\n",
-            l.name
-        ));
+        put(
+            &mut svg,
+            format_args!(
+                "<path class=\"line\" stroke=\"{colour}\" stroke-dasharray=\"{dash}\" d=\"{d}\"><title>{}</title></path>\n",
+                l.name
+            ),
+        );
         if let [only] = l.points.as_slice() {
             let (cx, cy) = (x.place(only.0), y.place(height(only.1)));
-            put(&mut svg, format_args!(
-                "<circle cx=\"{cx:.1}\" cy=\"{cy:.1}\" r=\"3\" fill=\"{colour}\"/>\n"
-            ));
+            put(
+                &mut svg,
+                format_args!("<circle cx=\"{cx:.1}\" cy=\"{cy:.1}\" r=\"3\" fill=\"{colour}\"/>\n"),
+            );
         }
     }
     svg.push_str("</svg><figcaption>");
     for (i, l) in lines.iter().enumerate() {
         let last = l.points.last().map(|p| short(p.1)).unwrap_or_default();
-        put(&mut svg, format_args!(
-            "<span><svg viewBox=\"0 0 26 8\" class=\"key\"><path class=\"line\" stroke=\"{}\" stroke-dasharray=\"{}\" d=\"M0 4H26\"/></svg>{} <b>{last}</b></span> ",
-            COLOURS[i % COLOURS.len()],
-            DASHES[i % DASHES.len()],
-            l.name
-        ));
+        put(
+            &mut svg,
+            format_args!(
+                "<span><svg viewBox=\"0 0 26 8\" class=\"key\"><path class=\"line\" stroke=\"{}\" stroke-dasharray=\"{}\" d=\"M0 4H26\"/></svg>{} <b>{last}</b></span> ",
+                COLOURS[i % COLOURS.len()],
+                DASHES[i % DASHES.len()],
+                l.name
+            ),
+        );
     }
     svg.push_str("</figcaption></figure>\n");
     Some(svg)
@@ -239,8 +258,11 @@ fn page(experiment: &Experiment, log: &str) -> String {
 pub(super) fn write(experiment: &Experiment) -> Result<(), FitError> {
     let out = &experiment.run.out;
     let path = out.join("log.jsonl");
-    let log = std::fs::read_to_string(&path)
-        .map_err(|source| FitError::Io { action: "read", path, source })?;
+    let log = std::fs::read_to_string(&path).map_err(|source| FitError::Io {
+        action: "read",
+        path,
+        source,
+    })?;
     Ok(write_atomic(&out.join(PAGE), page(experiment, &log).as_bytes())?)
 }
 

@@ -53,11 +53,16 @@ pub(super) fn train_step(
         inputs.template_labels,
         inputs.template_ltrb,
     );
-    let aligned = state.align.as_ref().zip(experiment.align_factor(step)).and_then(|(a, factor)| {
-        let search: Vec<bool> =
-            batch.thermal.iter().zip(&batch.cross).map(|(thermal, cross)| thermal ^ cross).collect();
-        align_step(&a.branches, &experiment.align, factor, &output, [&batch.thermal, &search])
-    });
+    let aligned =
+        state.align.as_ref().zip(experiment.align_factor(step)).and_then(|(a, factor)| {
+            let search: Vec<bool> = batch
+                .thermal
+                .iter()
+                .zip(&batch.cross)
+                .map(|(thermal, cross)| thermal ^ cross)
+                .collect();
+            align_step(&a.branches, &experiment.align, factor, &output, [&batch.thermal, &search])
+        });
     let l = losses(
         weights,
         output.scores,

@@ -238,8 +238,7 @@ impl TrackerNet {
             .template_tokens(template_features.clone(), labels, ltrb)
             .reshape([b, t * f * f, d]);
         let search = self.head.search_tokens(search_features.clone());
-        let (filter, memory) =
-            self.head.predict_filter(Tensor::cat(vec![templates, search], 1), f);
+        let (filter, memory) = self.head.predict_filter(Tensor::cat(vec![templates, search], 1), f);
         let encoded = memory.clone().narrow(1, t * f * f, f * f);
         TrainOutput {
             scores: self.head.scores(filter.clone(), encoded.clone(), f),
