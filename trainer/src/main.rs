@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use tsda_trainer::align_report::{self, AlignOptions, WeightsFrom};
-use tsda_trainer::config::Experiment;
+use tsda_trainer::config::{AlignPreset, Experiment};
 use tsda_trainer::fit::{self, FitOptions, Outcome};
 use tsda_trainer::import::{self, ImportKind, ImportOptions};
 use tsda_trainer::processing::contact_sheet;
@@ -62,6 +62,16 @@ struct FitArgs {
     /// Backbone weights, or "scratch", instead of the configuration's.
     #[arg(long)]
     backbone: Option<String>,
+    /// Seed instead of the configuration's.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Row of the ablation instead of what [align] says: none, baseline, cm, pre-afa, pre-cfa,
+    /// enc-afa, enc-cfa or joint. See docs/alignment.md.
+    #[arg(long)]
+    align_preset: Option<AlignPreset>,
+    /// First step with alignment losses instead of the configuration's.
+    #[arg(long)]
+    align_start: Option<u64>,
     /// Where to compute.
     #[arg(long, value_enum, default_value_t = DeviceName::Flex)]
     device: DeviceName,
@@ -194,6 +204,15 @@ fn run_fit(args: &FitArgs) -> Result<()> {
     }
     if let Some(backbone) = &args.backbone {
         experiment.init.backbone = backbone.clone();
+    }
+    if let Some(seed) = args.seed {
+        experiment.run.seed = seed;
+    }
+    if let Some(preset) = args.align_preset {
+        experiment.align.select(preset);
+    }
+    if let Some(step) = args.align_start {
+        experiment.align.start_step = Some(step);
     }
     experiment.validate().context("command line")?;
     let options = FitOptions {

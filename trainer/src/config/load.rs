@@ -123,6 +123,7 @@ impl Experiment {
         let spec = self.model.spec().map_err(|e| write(e.to_string()))?;
         let mut full = self.clone();
         full.model = ModelConfig::from_spec(self.model.preset.clone(), &spec);
+        full.align = self.align.expanded();
         toml::to_string(&full).map_err(|e| write(e.to_string()))
     }
 }

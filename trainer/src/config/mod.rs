@@ -5,10 +5,15 @@
 //! line and the field. The resolved copy (presets expanded, paths made concrete, overrides applied)
 //! is written beside the results with [`Experiment::to_toml`].
 
+mod align;
 mod load;
 mod model;
 mod validate;
 
+pub use align::{
+    Adversarial, AdversarialConfig, AlignConfig, AlignPreset, AlignStage, Contrastive,
+    ContrastiveConfig,
+};
 pub use load::ConfigError;
 pub use model::ModelConfig;
 pub use validate::FieldError;
@@ -34,6 +39,8 @@ pub struct Experiment {
     pub processing: ProcessingConfig,
     /// Weights of the two losses.
     pub loss: LossConfig,
+    /// Training-only alignment of the two sensors.
+    pub align: AlignConfig,
     /// Optimiser, learning rates, freezing.
     pub optim: OptimConfig,
     /// Weights to start from.
@@ -380,6 +387,40 @@ impl Experiment {
         }
         let samples = self.run.epochs.saturating_mul(self.sampler.samples_per_epoch as u64);
         samples.div_ceil(self.run.batch.max(1) as u64)
+    }
+
+    /// First step with alignment losses (0-based), whether or not the run has any.
+    pub fn align_start(&self) -> u64 {
+        let samples = self.align.start_epoch.saturating_mul(self.sampler.samples_per_epoch as u64);
+        self.align.start_step.unwrap_or_else(|| samples.div_ceil(self.run.batch.max(1) as u64))
+    }
+
+    /// Share of the alignment weights in force at a step, 0 to 1; `None` before alignment starts
+    /// and in runs without.
+    pub fn align_factor(&self, step: u64) -> Option<f64> {
+        let done = step.checked_sub(self.align_start()).filter(|_| self.align.is_on())?;
+        let ramp = self.align.ramp_steps.max(1);
+        Some(((done + 1) as f64 / ramp as f64).min(1.0))
+    }
+
+    /// Would `other` align in another way? However the two tables say it.
+    pub fn align_differs(&self, other: &Self) -> bool {
+        let said = |e: &Self| {
+            let on = e.align.is_on();
+            let when = on.then(|| (e.align_start(), e.align.ramp_steps, e.align.lr));
+            let alone = e.align.preset == AlignPreset::Baseline;
+            (e.align.adversarial(), e.align.contrastive(), when, alone)
+        };
+        said(self) != said(other)
+    }
+
+    /// How training samples are drawn: `[sampler]`, or with one sensor only in the baseline row.
+    pub fn training_sampler(&self) -> SamplerConfig {
+        let mut sampler = self.sampler.clone();
+        if self.align.preset == AlignPreset::Baseline {
+            sampler.cross_modal_p = 0.0;
+        }
+        sampler
     }
 }
 

@@ -1,8 +1,8 @@
 //! Range checks of every field, each naming the field as it is written in the file.
 
 use super::{
-    DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig, ProcessingConfig,
-    RunConfig, SamplerConfig, ScheduleConfig,
+    AlignPreset, DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig,
+    ProcessingConfig, RunConfig, SamplerConfig, ScheduleConfig,
 };
 use tsda_eval::dataset::Split;
 use tsda_runtime::SpecError;
@@ -84,7 +84,8 @@ impl Experiment {
             return fail("init.backbone", "\"\"", "a path or \"scratch\"");
         }
         check_run(&self.run)?;
-        count("run.steps (or run.epochs)", self.total_steps(), 1, 100_000_000)
+        count("run.steps (or run.epochs)", self.total_steps(), 1, 100_000_000)?;
+        check_align(self)
     }
 }
 
@@ -175,6 +176,56 @@ fn check_optim(o: &OptimConfig) -> Result<(), FieldError> {
     }
     within("optim.dropout", o.dropout, 0.0, 0.95)?;
     within("optim.attention_dropout", o.attention_dropout, 0.0, 0.95)?;
+    Ok(())
+}
+
+fn check_hidden(field: &str, hidden: &[usize]) -> Result<(), FieldError> {
+    count(field, hidden.len() as u64, 0, 8)?;
+    hidden.iter().try_for_each(|width| count(field, *width as u64, 1, 1 << 16))
+}
+
+fn check_align(e: &Experiment) -> Result<(), FieldError> {
+    let a = &e.align;
+    let preset = || format!("\"{}\"", a.preset.name());
+    if let Some(b) = a.adversarial() {
+        within("align.adversarial.weight", b.weight, 0.0, 1e3)?;
+        within("align.adversarial.reversal", b.reversal, 0.0, 1e3)?;
+        check_hidden("align.adversarial.hidden", &b.hidden)?;
+    }
+    if let Some(b) = a.contrastive() {
+        within("align.contrastive.weight", b.weight, 0.0, 1e3)?;
+        within("align.contrastive.temperature", b.temperature, 1e-3, 1e3)?;
+        check_hidden("align.contrastive.hidden", &b.hidden)?;
+        count("align.contrastive.dim", b.dim as u64, 1, 1 << 16)?;
+        if e.run.batch < 2 {
+            let want = "at least 2: the contrastive loss compares the samples of a batch";
+            return fail("run.batch", e.run.batch, want);
+        }
+    }
+    if let Some(lr) = a.lr {
+        within("align.lr", lr, 0.0, 1.0)?;
+    }
+    match a.preset {
+        AlignPreset::None => {}
+        AlignPreset::Baseline | AlignPreset::Cm if a.is_on() => {
+            return fail("align.preset", preset(), "a row with alignment, or without its tables");
+        }
+        AlignPreset::Baseline => {}
+        _ if e.sampler.cross_modal_p == 0.0 => {
+            let want = "above 0 for every align.preset but \"none\" and \"baseline\"";
+            return fail("sampler.cross_modal_p", 0, want);
+        }
+        _ => {}
+    }
+    let (start, total) = (e.align_start(), e.total_steps());
+    if a.is_on() && start >= total {
+        let field = if a.start_step.is_some() { "align.start_step" } else { "align.start_epoch" };
+        let value = a.start_step.unwrap_or(a.start_epoch);
+        let want =
+            format!("before the end of the run: alignment would start at step {start} of {total}");
+        let want = want + " (runs counted in steps: set align.start_step or give --align-start)";
+        return fail(field, value, &want);
+    }
     Ok(())
 }
 

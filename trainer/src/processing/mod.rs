@@ -48,6 +48,13 @@ pub struct Sample {
     pub cross: bool,
 }
 
+impl Sample {
+    /// Are the templates thermal?
+    pub fn is_thermal(&self) -> bool {
+        self.templates.first().is_some_and(|t| t.modality == Modality::Thermal)
+    }
+}
+
 /// The random stream of one sample.
 pub fn sample_rng(seed: u64, index: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
