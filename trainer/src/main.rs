@@ -38,9 +38,13 @@ struct Source {
     /// The experiment (TOML).
     #[arg(long)]
     config: PathBuf,
-    /// Folder to take instead of the configuration's only data source.
-    #[arg(long)]
-    data: Option<PathBuf>,
+    /// Folder of a data source instead of the configuration's, as NAME=DIR (NAME: the entry's
+    /// `name`, else its `kind`); just DIR where the configuration has a single source. Repeatable.
+    #[arg(long, value_name = "[NAME=]DIR")]
+    data: Vec<String>,
+    /// Folder that relative paths of the configuration's data sources and weights start from.
+    #[arg(long, value_name = "DIR")]
+    data_root: Option<PathBuf>,
 }
 
 #[derive(clap::Args)]
@@ -170,16 +174,30 @@ fn main() -> ExitCode {
 }
 
 fn load(source: &Source) -> Result<Experiment> {
-    let mut experiment = Experiment::load(&source.config)?;
-    if let Some(path) = &source.data {
-        let [only] = experiment.data.as_mut_slice() else {
-            bail!(
-                "--data: {} names {} data sources; it can replace only a single one",
-                source.config.display(),
-                experiment.data.len()
-            );
+    let mut experiment = Experiment::load_from(&source.config, source.data_root.as_deref())?;
+    let config = source.config.display();
+    for text in &source.data {
+        let labels: Vec<String> = experiment.data.iter().map(|s| s.label().to_owned()).collect();
+        let named = text.split_once('=').and_then(|(name, dir)| {
+            let same: Vec<_> = (0..labels.len()).filter(|&i| labels[i] == name).collect();
+            (!same.is_empty()).then_some((same, dir))
+        });
+        let (entry, dir) = match named {
+            Some((same, dir)) if same.len() == 1 => (same[0], dir),
+            Some((same, _)) => bail!(
+                "--data {text}: {} sources of {config} are called so; give them different names \
+                 (key `name`)",
+                same.len()
+            ),
+            None if labels.len() == 1 => (0, text.as_str()),
+            None => bail!(
+                "--data {text}: {config} has {} data sources; say which one: NAME=DIR, NAME one \
+                 of {}",
+                labels.len(),
+                labels.join(", ")
+            ),
         };
-        only.path = path.clone();
+        experiment.data[entry].path = PathBuf::from(dir);
     }
     Ok(experiment)
 }
@@ -281,6 +299,15 @@ fn run_sheet(args: &SheetArgs) -> Result<()> {
     let mut png = std::io::Cursor::new(Vec::new());
     sheet.write_to(&mut png, image::ImageFormat::Png).context("cannot encode the sheet")?;
     tsda_trainer::checkpoint::write_atomic(Path::new(&args.out), png.get_ref())?;
+    for share in maker.sampler().shares() {
+        println!(
+            "source {}: {} sequences, {:.1} % of the samples ({:.1} % across sensors)",
+            share.label,
+            share.sequences,
+            100.0 * (share.same + share.cross),
+            100.0 * share.cross
+        );
+    }
     for (row, sample) in samples.iter().enumerate() {
         println!("row {row}: {}", sample.id);
     }

@@ -49,22 +49,16 @@ pub struct Experiment {
     pub run: RunConfig,
 }
 
-/// Layout of a data source.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum DataKind {
-    /// Registered RGB/thermal stills with an `index.json`.
-    Pairs,
-    /// Clips in LasHeR's layout with an `index.json`.
-    Sequences,
-}
-
 /// One set of sequences to draw from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataSource {
-    /// Layout of the folder.
-    pub kind: DataKind,
+    /// Name in logs and on the command line (`--data NAME=DIR`); the kind's name when left out.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub name: String,
+    /// Layout of the folder, as `tsda data-check` and `tsda eval` name it: `KIND[/option..]`
+    /// ([`tsda_eval::dataset::KINDS`]).
+    pub kind: String,
     /// The folder; relative paths are tried beside the configuration file, then from the current
     /// folder.
     pub path: PathBuf,
@@ -74,9 +68,38 @@ pub struct DataSource {
     /// Split validated on; an empty string leaves the source out of validation.
     #[serde(default = "val_split")]
     pub validation_split: String,
-    /// Relative frequency among the sources.
+    /// Share of the samples, relative to the other sources' weights.
     #[serde(default = "one")]
     pub weight: f64,
+    /// Only sequences whose name contains one of these texts; all when empty.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub only: Vec<String>,
+    /// Take part in `sampler.random_region_p`? When left out, sources do whose kind promises
+    /// registered sensors (`pairs`, `pseudo`, `lasher`, `rgbt210`, `antiuav/registered`).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub regions: Option<bool>,
+}
+
+impl DataSource {
+    /// What logs call it.
+    pub fn label(&self) -> &str {
+        if self.name.is_empty() { &self.kind } else { &self.name }
+    }
+
+    /// May targets be random regions?
+    pub fn draws_regions(&self) -> bool {
+        let registered = ["pairs", "pseudo", "lasher", "rgbt210", "antiuav/registered"];
+        self.regions.unwrap_or_else(|| registered.contains(&self.kind.as_str()))
+    }
+
+    /// Sensors that material of this kind can hold: `(RGB, thermal)`.
+    pub fn sensors(&self) -> (bool, bool) {
+        match self.kind.as_str() {
+            "otb" | "got10k" | "coco" | "otb/zero-based" => (true, false),
+            kind if kind.split('/').any(|word| word == "thermal") => (false, true),
+            _ => (true, true),
+        }
+    }
 }
 
 fn train_split() -> String {
@@ -95,17 +118,17 @@ fn one() -> f64 {
 pub struct SamplerConfig {
     /// Template frames per sample; all of one sensor.
     pub templates: usize,
-    /// Chance that the search frame comes from the other sensor.
+    /// Share of samples whose search frame comes from the other sensor, over all sources together.
     pub cross_modal_p: f64,
-    /// Share of samples whose target is a random textured region of a registered pair instead of
-    /// an annotated box.
+    /// Share of the samples of sources that draw regions (`data.regions`) whose target is a random
+    /// textured region instead of an annotated box.
     pub random_region_p: f64,
     /// Smallest side of a random region in pixels.
     pub region_min: f32,
     /// Largest side of a random region in pixels (and never above half the picture's short side).
     pub region_max: f32,
-    /// A region counts as textured when, in every sensor, its mean gradient is at least this share
-    /// of the picture's.
+    /// A region counts as textured when, in every sensor drawn, its mean gradient is at least this
+    /// share of the picture's.
     pub region_texture: f32,
     /// Annotated boxes with a smaller `sqrt(w h)` are not used, in pixels.
     pub min_target: f32,

@@ -96,6 +96,67 @@ fn values_out_of_range_name_field_and_line() {
 }
 
 #[test]
+fn sources_are_checked_by_entry_and_field() {
+    let second = |lines: &str| format!("{MINIMAL}[[data]]\npath = \"q\"\n{lines}\n");
+    for (lines, field, say) in [
+        ("kind = \"video\"", "data.1.kind", "antiuav[/registered]"),
+        ("kind = \"otb/zero_based\"", "data.1.kind", "otb[/thermal|/zero-based]"),
+        ("kind = \"coco\"\nname = \"a=b\"", "data.1.name", "without '='"),
+        ("kind = \"coco\"\nonly = [\"\"]", "data.1.only", "non-empty"),
+        ("kind = \"coco\"\nsplit = \"trian\"", "data.1.split", "\"train\""),
+        ("kind = \"coco\"\nweight = 0.0", "data.1.weight", "above 0"),
+    ] {
+        let e = parse(&second(lines)).unwrap_err().to_string();
+        assert!(e.contains(field) && e.contains(say) && e.contains("line "), "{lines}: {e}");
+    }
+    let twins = second(
+        "kind = \"coco\"\nname = \"a\"\n[[data]]\nkind = \"coco\"\npath = \"r\"\nname = \"a\"",
+    );
+    let e = parse(&twins).unwrap_err().to_string();
+    assert!(e.contains("data.2.name = \"a\""), "{e}");
+    for (kind, sensors, regions) in [
+        ("pairs", (true, true), true),
+        ("antiuav", (true, true), false),
+        ("antiuav/registered", (true, true), true),
+        ("otb", (true, false), false),
+        ("coco/thermal", (false, true), false),
+    ] {
+        let a = parse(&second(&format!("kind = \"{kind}\""))).unwrap();
+        let source = &a.data[1];
+        assert_eq!((source.label(), source.sensors()), (kind, sensors));
+        assert_eq!(source.draws_regions(), regions, "{kind}");
+        let set = DataSource { regions: Some(!regions), ..source.clone() };
+        assert_eq!(set.draws_regions(), !regions, "{kind}");
+    }
+    let named = parse(&second("kind = \"got10k\"\nname = \"a\"\nonly = [\"x\"]\nregions = true"));
+    let named = named.unwrap();
+    assert_eq!(parse(&named.to_toml().unwrap()).unwrap().data, named.data);
+}
+
+#[test]
+fn a_root_is_put_before_relative_paths_only() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("x.toml");
+    let root = dir.path().join("root");
+    std::fs::create_dir_all(root.join("weights")).unwrap();
+    std::fs::create_dir_all(dir.path().join("p")).unwrap();
+    std::fs::write(root.join("weights/b.safetensors"), "").unwrap();
+    let text = format!(
+        "{MINIMAL}[[data]]\nkind = \"coco\"\npath = \"/abs\"\n\
+         [init]\nbackbone = \"weights/b.safetensors\"\nweights = \"w.safetensors\"\n"
+    );
+    std::fs::write(&file, text).unwrap();
+    let plain = Experiment::load(&file).unwrap();
+    assert_eq!(plain.data[0].path, dir.path().join("p"));
+    assert_eq!(plain.init.backbone, "weights/b.safetensors");
+    let a = Experiment::load_from(&file, Some(&root)).unwrap();
+    assert_eq!(a.data[0].path, root.join("p"));
+    assert_eq!(a.data[1].path, Path::new("/abs"));
+    assert_eq!(Path::new(&a.init.backbone), root.join("weights/b.safetensors"));
+    assert_eq!(a.init.weights, "w.safetensors");
+}
+
+#[test]
 fn a_missing_file_is_named() {
     let e = Experiment::load(Path::new("no/such.toml")).unwrap_err().to_string();
     assert!(e.contains("no/such.toml"), "{e}");

@@ -4,7 +4,7 @@ use super::{
     AlignPreset, DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig,
     ProcessingConfig, RunConfig, SamplerConfig, ScheduleConfig,
 };
-use tsda_eval::dataset::Split;
+use tsda_eval::dataset::{KINDS, Kind, Split, kind_of};
 use tsda_runtime::SpecError;
 
 /// A field whose value cannot be used.
@@ -67,6 +67,11 @@ impl Experiment {
         }
         for (i, source) in self.data.iter().enumerate() {
             check_source(i, source)?;
+            let twin = |s: &DataSource| !s.name.is_empty() && s.name == source.name;
+            if self.data[..i].iter().any(twin) {
+                let field = format!("data.{i}.name");
+                return fail(&field, format!("{:?}", source.name), "a name no other source has");
+            }
         }
         check_sampler(&self.sampler)?;
         if self.sampler.templates > usize::from(spec.templates) {
@@ -90,6 +95,18 @@ impl Experiment {
 }
 
 fn check_source(i: usize, source: &DataSource) -> Result<(), FieldError> {
+    if kind_of(&source.kind).is_err() {
+        let all = KINDS.iter().map(Kind::to_string).collect::<Vec<_>>().join(", ");
+        let value = format!("{:?}", source.kind);
+        return fail(&format!("data.{i}.kind"), value, &format!("one of {all}"));
+    }
+    if source.name.contains(['=', '/', '\\']) {
+        let value = format!("{:?}", source.name);
+        return fail(&format!("data.{i}.name"), value, "a name without '=', '/' and '\\'");
+    }
+    if source.only.iter().any(String::is_empty) {
+        return fail(&format!("data.{i}.only"), "[\"\"]", "a list of non-empty texts");
+    }
     positive(&format!("data.{i}.weight"), source.weight)?;
     for (field, name, optional) in
         [("split", &source.split, false), ("validation_split", &source.validation_split, true)]
