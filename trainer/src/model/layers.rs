@@ -32,6 +32,11 @@ impl Geometry {
         Self { kernel, stride, pad: (kernel / 2, kernel / 2), groups: 1 }
     }
 
+    /// The same with this many groups.
+    pub const fn grouped(self, groups: usize) -> Self {
+        Self { groups, ..self }
+    }
+
     /// TensorFlow "SAME": at stride 2 on even sides the odd pixel of padding goes behind.
     pub const fn same(kernel: usize, stride: usize, groups: usize) -> Self {
         let total = kernel - stride;
@@ -116,6 +121,8 @@ pub(crate) enum Activation {
     Relu,
     /// `min(max(x, 0), 6)`.
     Relu6,
+    /// `x * min(max(x / 6 + 0.5, 0), 1)`.
+    HardSwish,
 }
 
 impl Activation {
@@ -125,6 +132,7 @@ impl Activation {
             Self::Identity => x,
             Self::Relu => burn::tensor::activation::relu(x),
             Self::Relu6 => x.clamp(0.0, 6.0),
+            Self::HardSwish => burn::tensor::activation::hard_swish(x),
         }
     }
 }
