@@ -121,6 +121,7 @@ impl BackboneNet {
     pub fn forward_wide(&self, x: Tensor<4>, frozen: usize) -> Tensor<4> {
         match self {
             Self::EfficientNet(net) if frozen > 0 => net.forward_wide(x, frozen),
+            Self::MobileNet(net) if frozen > 0 => net.forward_wide(x, frozen),
             _ => self.forward(x, frozen).permute([1, 0, 2, 3]),
         }
     }

@@ -219,6 +219,20 @@ impl WideConv {
     pub fn depthwise_relu6(&self, x: Tensor<4>) -> Tensor<4> {
         kernels::depthwise_relu6(x, self.weight.clone(), self.bias.clone(), self.window)
     }
+
+    /// 1x1 convolution with hard-swish, `(in, N, H, W)` to `(out, N, H, W)`.
+    pub fn pointwise_hard_swish(&self, x: Tensor<4>) -> Tensor<4> {
+        let [inp, n, h, w] = x.dims();
+        let y = self.weight.clone().matmul(x.reshape([inp, n * h * w]));
+        let y = kernels::mobile::bias_hard_swish(y, self.bias.clone());
+        let out = y.dims()[0];
+        y.reshape([out, n, h, w])
+    }
+
+    /// Depthwise convolution without activation, `(C, N, H, W)` to `(C, N, H', W')`.
+    pub fn depthwise(&self, x: Tensor<4>) -> Tensor<4> {
+        kernels::mobile::depthwise(x, self.weight.clone(), self.bias.clone(), self.window)
+    }
 }
 
 /// Weight and bias of the convolution that equals `bn` after `conv`.

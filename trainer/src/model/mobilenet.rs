@@ -4,12 +4,14 @@
 //! batch-norm eps 1e-5, symmetric padding `kernel / 2`. In blocks that expand, the gate comes before
 //! the activation; the first block does not expand and gates behind it.
 
-use super::layers::{Activation, Conv, FrozenBatchNorm, Geometry, conv_bn};
+use super::kernels::mobile;
+use super::layers::{Activation, Conv, FrozenBatchNorm, Geometry, WideConv, conv_bn};
 use super::transformer::linear_layer;
 use burn::nn::Linear;
 use burn::prelude::*;
 use burn::tensor::activation::{hard_sigmoid, relu};
 use burn::tensor::module::adaptive_avg_pool2d;
+use rayon::prelude::*;
 
 const EPSILON: f64 = 1e-5;
 
@@ -152,6 +154,75 @@ impl Block {
         let y = conv_bn(&self.project, &self.bn2, Activation::Identity, on_graph, y);
         if self.residual { y + x } else { y }
     }
+
+    /// Ready for batch-wide maps.
+    fn wide(&self, on_graph: bool) -> WideBlock<'_> {
+        let fold = |conv, bn| WideConv::new(conv, bn, on_graph);
+        WideBlock {
+            expand: self.expand.as_ref().zip(self.bn0.as_ref()).map(|(c, b)| fold(c, b)),
+            depthwise: fold(&self.depthwise, &self.bn1),
+            gate: self.gate.as_ref(),
+            project: fold(&self.project, &self.bn2),
+            residual: self.residual,
+            activation: self.activation,
+            on_graph,
+        }
+    }
+}
+
+/// [`Block`] on batch-wide maps `(C, N, H, W)`.
+struct WideBlock<'a> {
+    expand: Option<WideConv>,
+    depthwise: WideConv,
+    gate: Option<&'a Gate>,
+    project: WideConv,
+    residual: bool,
+    activation: Activation,
+    on_graph: bool,
+}
+
+impl WideBlock<'_> {
+    fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        let y = match &self.expand {
+            Some(expand) => {
+                let y = match self.activation {
+                    Activation::HardSwish => expand.pointwise_hard_swish(x.clone()),
+                    other => other.apply(expand.pointwise(x.clone())),
+                };
+                self.gated_activation(self.depthwise.depthwise(y))
+            }
+            None => self.gated(self.activation.apply(self.depthwise.depthwise(x.clone()))),
+        };
+        let y = self.project.pointwise(y);
+        if self.residual { y + x } else { y }
+    }
+
+    /// Factors `(C * N)` of rows `(C * N, P)`.
+    fn factors(&self, gate: &Gate, rows: Tensor<2>, [c, n]: [usize; 2]) -> Tensor<1> {
+        let means = rows.mean_dim(1).reshape([c, n]).swap_dims(0, 1);
+        gate.factors(means, self.on_graph).swap_dims(0, 1).reshape([c * n])
+    }
+
+    fn gated(&self, y: Tensor<4>) -> Tensor<4> {
+        let Some(gate) = self.gate else { return y };
+        let [c, n, h, w] = y.dims();
+        let rows = y.reshape([c * n, h * w]);
+        let factors = self.factors(gate, rows.clone(), [c, n]).reshape([c * n, 1]);
+        (rows * factors).reshape([c, n, h, w])
+    }
+
+    /// Gate, then activation.
+    fn gated_activation(&self, y: Tensor<4>) -> Tensor<4> {
+        match (self.gate, self.activation) {
+            (Some(gate), Activation::HardSwish) => {
+                let [c, n, h, w] = y.dims();
+                let rows = y.reshape([c * n, h * w]);
+                let factors = self.factors(gate, rows.clone(), [c, n]);
+                mobile::gated_hard_swish(rows, factors).reshape([c, n, h, w])
+            }
+            (_, activation) => activation.apply(self.gated(y)),
+        }
+    }
 }
 
 /// Stem and the first 8 or 9 blocks.
@@ -182,6 +253,27 @@ impl MobileNetV3 {
             x = block.forward(x, frozen < i + 2);
         }
         x
+    }
+}
+
+impl MobileNetV3 {
+    /// [`Self::forward`] for training on the CPU, as a batch-wide map `(C, B, S/16, S/16)`. At least
+    /// the stem has to be frozen.
+    pub fn forward_wide(&self, x: Tensor<4>, frozen: usize) -> Tensor<4> {
+        let leading = frozen.saturating_sub(1).min(self.blocks.len());
+        let (frozen, trained) = self.blocks.split_at(leading);
+        let frozen: Vec<_> = frozen.iter().map(|block| block.wide(false)).collect();
+        let trained: Vec<_> = trained.iter().map(|block| block.wide(true)).collect();
+        // Image by image: the large early maps stay in the cache, and every core has its own.
+        let images: Vec<Tensor<4>> = x.inner().split(1, 0);
+        let maps: Vec<Tensor<4>> = images
+            .into_par_iter()
+            .map(|image| {
+                let x = conv_bn(&self.stem, &self.bn, Activation::HardSwish, false, image);
+                frozen.iter().fold(x.swap_dims(0, 1), |x, block| block.forward(x))
+            })
+            .collect();
+        trained.iter().fold(Tensor::cat(maps, 1), |x, block| block.forward(x))
     }
 }
 
