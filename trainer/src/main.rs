@@ -91,8 +91,9 @@ enum DeviceName {
 
 #[derive(clap::Args)]
 struct ImportArgs {
-    /// What the input holds: "pytracking" (a ToMP checkpoint), "torchvision-resnet" or
-    /// "efficientnet-lite0" (backbones), "full" (a whole network). Found out when not given.
+    /// What the input holds: "pytracking" (a ToMP checkpoint), "torchvision-resnet",
+    /// "efficientnet-lite0" or "nanotrack" (backbones), "full" (a whole network). Found out when not
+    /// given.
     #[arg(long)]
     kind: Option<ImportKind>,
     /// File to read: PyTorch (zip or legacy) or safetensors.
@@ -101,7 +102,7 @@ struct ImportArgs {
     /// File to write: safetensors that say which network they are of.
     #[arg(long)]
     out: PathBuf,
-    /// The network the weights have to be of: "tomp101", "tomp50" or "nano". Found out when not
+    /// The network the weights have to be of: "tomp101", "tomp50", "nano", ... Found out when not
     /// given; filter size and test-frame embedding always are the file's.
     #[arg(long, conflicts_with = "config")]
     preset: Option<String>,

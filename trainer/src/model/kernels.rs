@@ -8,6 +8,8 @@
 //! Inference and graph capture never come here; the same numbers come from `conv2d` there, and
 //! tests compare both ways.
 
+pub(crate) mod mobile;
+
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;

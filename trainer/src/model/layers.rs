@@ -32,6 +32,11 @@ impl Geometry {
         Self { kernel, stride, pad: (kernel / 2, kernel / 2), groups: 1 }
     }
 
+    /// The same with this many groups.
+    pub const fn grouped(self, groups: usize) -> Self {
+        Self { groups, ..self }
+    }
+
     /// TensorFlow "SAME": at stride 2 on even sides the odd pixel of padding goes behind.
     pub const fn same(kernel: usize, stride: usize, groups: usize) -> Self {
         let total = kernel - stride;
@@ -116,6 +121,8 @@ pub(crate) enum Activation {
     Relu,
     /// `min(max(x, 0), 6)`.
     Relu6,
+    /// `x * min(max(x / 6 + 0.5, 0), 1)`.
+    HardSwish,
 }
 
 impl Activation {
@@ -125,6 +132,7 @@ impl Activation {
             Self::Identity => x,
             Self::Relu => burn::tensor::activation::relu(x),
             Self::Relu6 => x.clamp(0.0, 6.0),
+            Self::HardSwish => burn::tensor::activation::hard_swish(x),
         }
     }
 }
@@ -210,6 +218,20 @@ impl WideConv {
     /// Depthwise convolution with ReLU6, `(C, N, H, W)` to `(C, N, H', W')`.
     pub fn depthwise_relu6(&self, x: Tensor<4>) -> Tensor<4> {
         kernels::depthwise_relu6(x, self.weight.clone(), self.bias.clone(), self.window)
+    }
+
+    /// 1x1 convolution with hard-swish, `(in, N, H, W)` to `(out, N, H, W)`.
+    pub fn pointwise_hard_swish(&self, x: Tensor<4>) -> Tensor<4> {
+        let [inp, n, h, w] = x.dims();
+        let y = self.weight.clone().matmul(x.reshape([inp, n * h * w]));
+        let y = kernels::mobile::bias_hard_swish(y, self.bias.clone());
+        let out = y.dims()[0];
+        y.reshape([out, n, h, w])
+    }
+
+    /// Depthwise convolution without activation, `(C, N, H, W)` to `(C, N, H', W')`.
+    pub fn depthwise(&self, x: Tensor<4>) -> Tensor<4> {
+        kernels::mobile::depthwise(x, self.weight.clone(), self.bias.clone(), self.window)
     }
 }
 

@@ -37,6 +37,7 @@ mod head;
 pub mod inspect;
 mod kernels;
 mod layers;
+mod mobilenet;
 mod names;
 mod pooled;
 mod resnet;

@@ -1,6 +1,7 @@
 //! The network against the reference (golden vectors) and against itself.
 
 mod as_written;
+mod mobilenet;
 mod rearrangements;
 
 use super::*;
