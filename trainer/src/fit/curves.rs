@@ -14,6 +14,8 @@ const PLOT: [f64; 4] = [58.0, 30.0, 428.0, 212.0];
 const POINTS: usize = 400;
 /// Okabe-Ito colours, which all kinds of colour vision tell apart.
 const COLOURS: [&str; 3] = ["#0072B2", "#D55E00", "#009E73"];
+/// Least value of a logarithmic axis.
+const TINY: f64 = 1e-12;
 const DASHES: [&str; 3] = ["none", "6 3", "2 3"];
 
 /// A chart: title, logarithmic, event, and the lines with the pointers to their numbers.
@@ -122,13 +124,27 @@ fn short(value: f64) -> String {
     }
 }
 
+/// Ticks of a logarithmic axis: decades, with 2 and 5 between them where there are few.
+fn decades(values: impl Iterator<Item = f64>) -> Vec<(f64, String)> {
+    let (low, high) = values
+        .map(|v| v.max(TINY).log10())
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
+    let between: &[f64] = if high - low < 2.0 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+    (low.floor() as i32..=high.ceil() as i32)
+        .flat_map(|power| between.iter().map(move |m| m * 10f64.powi(power)))
+        .map(|v| (v.log10(), v))
+        .filter(|(at, _)| (low..=high).contains(at))
+        .map(|(at, v)| (at, if v >= 1.0 { format!("{v}") } else { short(v) }))
+        .collect()
+}
+
 /// One chart; `start` is a step to mark. `None` without any number.
 fn chart(
     (title, log, event, series): &Chart,
     entries: &[Value],
     start: Option<u64>,
 ) -> Option<String> {
-    let height = |v: f64| if *log { v.max(1e-12).log10() } else { v };
+    let height = |v: f64| if *log { v.max(TINY).log10() } else { v };
     let lines: Vec<Line> = series
         .iter()
         .map(|(name, pointer)| line(entries, event, name, pointer))
@@ -149,8 +165,8 @@ fn chart(
          <title>{0}</title><text x=\"{left}\" y=\"18\" class=\"name\">{0}</text>\n",
         escape(title)
     );
-    for (value, text) in y.ticks() {
-        let text = if *log { short(10f64.powf(value)) } else { text };
+    let ticks = if *log { decades(points().map(|p| p.1).chain([first.1])) } else { y.ticks() };
+    for (value, text) in ticks {
         let at = y.place(value);
         put(
             &mut svg,
@@ -295,6 +311,15 @@ mod tests {
         // Long logs are thinned without losing their ends' values.
         let many = line(&entries(&log(0..3000)), "train", "loss", "/loss");
         assert!(many.points.len() <= POINTS);
+    }
+
+    #[test]
+    fn logarithmic_axes_have_round_ticks() {
+        let texts = |values: &[f64]| -> Vec<String> {
+            decades(values.iter().copied()).into_iter().map(|(_, t)| t).collect()
+        };
+        assert_eq!(texts(&[1.9, 6.0]), ["2", "5"]);
+        assert_eq!(texts(&[0.03, 9000.0]), ["0.1000", "1", "10", "100", "1000"]);
     }
 
     #[test]
