@@ -296,3 +296,15 @@ fn alignment_that_cannot_be_is_refused() {
         assert!(matches!(parse(&format!("{MINIMAL}{text}")), Err(ConfigError::Parse { .. })));
     }
 }
+
+#[test]
+fn another_backbone_brings_its_own_input_statistics() {
+    let of = |text: &str| toml::from_str::<ModelConfig>(text).unwrap().spec().unwrap();
+    let raw = of("preset = \"nano\"\nbackbone = \"nanotrack_v3\"");
+    assert_eq!((raw.input_mean, raw.input_std), ([0.0; 3], [1.0 / 255.0; 3]));
+    assert_eq!(raw, tsda_runtime::ModelSpec::PICO_V3);
+    let imagenet = of("preset = \"pico\"\nbackbone = \"efficient_net_lite0\"");
+    assert_eq!(imagenet, tsda_runtime::ModelSpec::NANO);
+    let own = of("preset = \"pico\"\ninput_mean = [0.5, 0.5, 0.5]\ncrop = 192");
+    assert_eq!((own.input_mean, own.input_std), ([0.5; 3], [1.0 / 255.0; 3]));
+}
