@@ -11,9 +11,11 @@ mod state;
 #[cfg(test)]
 mod step_tests;
 mod tensors;
+mod throughput;
 
 pub use evaluate::{Group, Validation, best_box};
 pub use optim::lr_factor;
+pub use throughput::{Throughput, throughput};
 
 use crate::checkpoint::{CheckpointError, CheckpointStore, write_atomic};
 use crate::config::{ConfigError, Experiment, SCRATCH};
@@ -35,6 +37,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 use tensors::Inputs;
+use throughput::StepTimes;
 use tsda_runtime::SpecError;
 
 /// Keeps the validation samples apart from the training ones of the same seed.
@@ -425,6 +428,7 @@ struct StepFigures {
     cls: f64,
     giou: f64,
     grad_norm: f64,
+    times: StepTimes,
 }
 
 fn train_step(
@@ -442,6 +446,7 @@ fn train_step(
         }
         Err(FitError::NotFinite { step, what, value, ids: batch.ids.clone() })
     };
+    let started = Instant::now();
     let inputs = Inputs::new(batch, state.net.spec(), device);
     let output = state.net.forward_train(
         inputs.template_crops,
@@ -460,13 +465,16 @@ fn train_step(
     let loss = finite("loss", l.total.clone().into_scalar::<f32>())?;
     let cls = f64::from(l.classification.into_scalar::<f32>());
     let giou = f64::from(l.giou.into_scalar::<f32>());
+    let forward = started.elapsed();
     let gradients = GradientsParams::from_grads(l.total.backward(), &state.net);
+    let backward = started.elapsed() - forward;
     let gradients = optim::complete(&state.net, gradients);
     let norm = optim::gradient_norm(&state.net, &gradients);
     let grad_norm = finite("gradient norm", norm)?;
     let gradients = optim::clip(&state.net, gradients, norm, experiment.optim.clip_norm);
     state.update(rate, gradients, experiment.optim.ema_decay);
-    Ok(StepFigures { loss, cls, giou, grad_norm })
+    let times = StepTimes { forward, backward, update: started.elapsed() - forward - backward };
+    Ok(StepFigures { loss, cls, giou, grad_norm, times })
 }
 
 #[cfg(test)]
