@@ -56,6 +56,7 @@ fn cases() -> anyhow::Result<Vec<Case>> {
 }
 
 fn main() -> anyhow::Result<()> {
+    tsda_trainer::memory::keep_freed_memory();
     for Case { preset, crop, batch, steps } in cases()? {
         // The settings of configs/nano.toml that cost time.
         let text = format!(
