@@ -17,6 +17,7 @@ pub mod fit;
 pub mod import;
 pub mod logging;
 pub mod losses;
+pub mod memory;
 pub mod model;
 pub mod prefetch;
 pub mod processing;

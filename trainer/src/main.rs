@@ -159,6 +159,7 @@ struct AlignArgs {
 }
 
 fn main() -> ExitCode {
+    tsda_trainer::memory::keep_freed_memory();
     let result = match Cli::parse().command {
         Command::Fit(args) => run_fit(&args),
         Command::WeightsImport(args) => run_import(&args),

@@ -165,8 +165,6 @@ fn a_missing_file_is_named() {
 /// Loads a configuration of the folder `configs`.
 fn shipped(path: &Path) -> Experiment {
     let text = std::fs::read_to_string(path).unwrap();
-    // UNTIL-LASHER-KIND: drop this replacement once `DataKind` has `lasher`.
-    let text = text.replace("kind = \"lasher\"", "kind = \"sequences\"");
     parse(&text).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 

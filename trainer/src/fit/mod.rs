@@ -14,9 +14,11 @@ mod step;
 #[cfg(test)]
 mod step_tests;
 mod tensors;
+mod throughput;
 
 pub use evaluate::{Group, Validation, best_box};
 pub use optim::lr_factor;
+pub use throughput::{Throughput, throughput};
 
 use crate::align::Figures;
 use crate::checkpoint::{CheckpointError, CheckpointStore, write_atomic};

@@ -2,6 +2,7 @@
 
 use super::state::State;
 use super::tensors::Inputs;
+use super::throughput::StepTimes;
 use super::{FitError, optim};
 use crate::align::{Figures, align_step};
 use crate::config::Experiment;
@@ -10,6 +11,7 @@ use crate::processing::Batch;
 use burn::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::optim::GradientsParams;
 use burn::prelude::*;
+use std::time::Instant;
 
 /// Figures of one step.
 #[derive(Clone, Debug, Default)]
@@ -22,6 +24,8 @@ pub(super) struct StepFigures {
     pub grad_norm: f64,
     /// Of the alignment branches, while they are on.
     pub align: Figures,
+    /// What its parts took.
+    pub times: StepTimes,
 }
 
 /// Learning rates of a step.
@@ -46,6 +50,7 @@ pub(super) fn train_step(
         }
         Err(FitError::NotFinite { step, what, value, ids: batch.ids.clone() })
     };
+    let started = Instant::now();
     let inputs = Inputs::new(batch, state.net.spec(), device);
     let output = state.net.forward_train(
         inputs.template_crops,
@@ -84,7 +89,9 @@ pub(super) fn train_step(
             align.insert(name, finite(name, norm)?);
         }
     }
+    let forward = started.elapsed();
     let gradients = GradientsParams::from_grads(root.backward(), &state.net);
+    let backward = started.elapsed() - forward;
     let gradients = optim::complete(&state.net, gradients);
     let norm = optim::gradient_norm(&state.net, &gradients);
     let grad_norm = finite("gradient norm", norm)?;
@@ -94,5 +101,6 @@ pub(super) fn train_step(
         branches.update(rates.align, aligned, clip);
     }
     state.update(rates.net, gradients, experiment.optim.ema_decay);
-    Ok(StepFigures { loss, cls, giou, grad_norm, align })
+    let times = StepTimes { forward, backward, update: started.elapsed() - forward - backward };
+    Ok(StepFigures { loss, cls, giou, grad_norm, align, times })
 }

@@ -22,10 +22,9 @@
 //!
 //! # Speed
 //! On the CPU, training takes another road than inference through the convolutions: batch-wide maps
-//! and the operations of `kernels`. Numbers and gradients are the same (tested). The nano network at
-//! crop 160 with batch 16 (two templates each) takes 1.6 CPU seconds per step, 1.8 with dropout on
-//! attention weights too; the allocator's returning of large buffers to the system costs up to 15 %
-//! more, which `MALLOC_MMAP_THRESHOLD_` and `MALLOC_TRIM_THRESHOLD_` (glibc) avoid.
+//! and the operations of `kernels`. Numbers and gradients are the same (tested);
+//! `cargo bench -p tsda-trainer --bench throughput` measures a step, and
+//! `scripts/torch_throughput.py` the same network in PyTorch (figures: docs/training.md).
 //!
 //! Frozen layers ([`FreezePolicy`]) run outside autodiff and keep no graph. Batch norms of the
 //! backbone never update their statistics; they are folded into the convolutions before them in

@@ -1,7 +1,8 @@
 //! What MobileNetV3 adds: depthwise convolution without limits, hard-swish behind a bias and behind
 //! the gate of a squeeze-excite.
 
-use super::{Plan, Window, dims, dot, sum, tensor};
+use super::depthwise::{self, Limits};
+use super::{Window, dims, sum, tensor};
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
@@ -189,6 +190,18 @@ fn slope(x: f32) -> f32 {
     if x <= -3.0 { 0.0 } else { right }
 }
 
+/// Scalar product in eight lanes, as [`sum`].
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
+    let mut lanes = [0.0f32; 8];
+    for (a, b) in a.iter().zip(b) {
+        for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
+            *lane += a * b;
+        }
+    }
+    lanes.iter().sum::<f32>() + a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum::<f32>()
+}
+
 /// `f(x, p)` of every element of rows x `(R, P)` with one number `p` per row.
 fn by_row(
     x: FlexTensor,
@@ -242,32 +255,7 @@ impl MobileOps for Flex {
         bias: FlexTensor,
         window: Window,
     ) -> FlexTensor {
-        let (x, weight, bias) = (x.to_contiguous(), weight.to_contiguous(), bias.to_contiguous());
-        let [c, n, h, w] = dims(&x);
-        let plan = Plan::new([h, w], window);
-        let (xs, ws, bs) = (x.storage::<f32>(), weight.storage::<f32>(), bias.storage::<f32>());
-        let taps = window.kernel * window.kernel;
-        let mut y = vec![0.0f32; c * n * plan.out_plane()];
-        y.par_chunks_mut(n * plan.out_plane()).enumerate().for_each(|(ch, y)| {
-            let mut phases = plan.phases();
-            let mut sums = vec![0.0; plan.run()];
-            let weight = &ws[ch * taps..(ch + 1) * taps];
-            let images =
-                xs[ch * n * plan.plane()..(ch + 1) * n * plan.plane()].chunks_exact(plan.plane());
-            for (image, y) in images.zip(y.chunks_exact_mut(plan.out_plane())) {
-                plan.split(image, &mut phases);
-                sums.fill(bs[ch]);
-                for (tap, from) in plan.taps() {
-                    for (s, v) in sums.iter_mut().zip(&phases[from..]) {
-                        *s += weight[tap] * v;
-                    }
-                }
-                for (y, row) in y.chunks_exact_mut(plan.out[1]).zip(sums.chunks(plan.wide)) {
-                    y.copy_from_slice(&row[..plan.out[1]]);
-                }
-            }
-        });
-        tensor(y, &[c, n, plan.out[0], plan.out[1]])
+        depthwise::depthwise(x, weight, bias, window, Limits::Free)
     }
 
     fn bias_hard_swish(x: FlexTensor, bias: FlexTensor) -> FlexTensor {
@@ -287,49 +275,7 @@ impl MobileGradients for Flex {
         window: Window,
         needs_x: bool,
     ) -> (Option<FlexTensor>, FlexTensor, FlexTensor) {
-        let [x, weight, grad] = [x, weight, grad].map(|t| t.to_contiguous());
-        let [c, n, h, w] = dims(&x);
-        let plan = Plan::new([h, w], window);
-        let (xs, ws, gs) = (x.storage::<f32>(), weight.storage::<f32>(), grad.storage::<f32>());
-        let taps = window.kernel * window.kernel;
-        let (plane, out) = (n * plan.plane(), n * plan.out_plane());
-        let mut gx = vec![0.0f32; c * plane];
-        let mut gw = vec![0.0f32; c * taps];
-        let mut gb = vec![0.0f32; c];
-        gx.par_chunks_mut(plane)
-            .zip(gw.par_chunks_mut(taps))
-            .zip(gb.par_iter_mut())
-            .enumerate()
-            .for_each(|(ch, ((gx, gw), gb))| {
-                let (mut phases, mut spread) = (plan.phases(), plan.phases());
-                // The output gradient on the runs' grid, zeros behind every row.
-                let mut g = vec![0.0; plan.run()];
-                let images = xs[ch * plane..(ch + 1) * plane].chunks_exact(plan.plane());
-                let grads = gs[ch * out..(ch + 1) * out].chunks_exact(plan.out_plane());
-                let results = gx.chunks_exact_mut(plan.plane());
-                for ((image, grad), gx) in images.zip(grads).zip(results) {
-                    plan.split(image, &mut phases);
-                    for (g, grad) in g.chunks_mut(plan.wide).zip(grad.chunks_exact(plan.out[1])) {
-                        g[..plan.out[1]].copy_from_slice(grad);
-                    }
-                    *gb += sum(grad);
-                    for (tap, from) in plan.taps() {
-                        gw[tap] += dot(&g, &phases[from..from + g.len()]);
-                    }
-                    if needs_x {
-                        spread.fill(0.0);
-                        for (tap, from) in plan.taps() {
-                            let weight = ws[ch * taps + tap];
-                            for (s, g) in spread[from..].iter_mut().zip(&g) {
-                                *s += weight * g;
-                            }
-                        }
-                        plan.join(&spread, gx);
-                    }
-                }
-            });
-        let gx = needs_x.then(|| tensor(gx, &[c, n, h, w]));
-        (gx, tensor(gw, &[c, taps]), tensor(gb, &[c]))
+        depthwise::depthwise_backward(x, weight, None, grad, window, needs_x)
     }
 
     fn bias_hard_swish_backward(
