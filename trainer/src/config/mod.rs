@@ -134,6 +134,12 @@ pub struct SamplerConfig {
     pub min_target: f32,
     /// Largest distance in frames between the base template and any other frame of a video.
     pub gap: usize,
+    /// Chance that a target of another sequence of the source is pasted beside the target in the
+    /// search crop. Training only.
+    pub distractor_p: f64,
+    /// Chance that part of a picture of another sequence of the source covers part of the target in
+    /// the search crop. Training only.
+    pub occluder_p: f64,
     /// Samples that count as one epoch.
     pub samples_per_epoch: usize,
 }
@@ -149,6 +155,8 @@ impl Default for SamplerConfig {
             region_texture: 0.8,
             min_target: 8.0,
             gap: 200,
+            distractor_p: 0.0,
+            occluder_p: 0.0,
             samples_per_epoch: 4000,
         }
     }
@@ -189,6 +197,12 @@ pub struct ProcessingConfig {
     pub crop_flip_p: f64,
     /// Chance that the sample's RGB pictures turn grey.
     pub grayscale_p: f64,
+    /// Chance that the sample's RGB pictures turn into one random mixture of their channels instead,
+    /// which comes nearer to what a thermal camera shows of a coloured thing.
+    pub channel_mix_p: f64,
+    /// Largest share of the target's width and height that an occluder covers
+    /// (`sampler.occluder_p`).
+    pub occluder_side: f32,
     /// Brightness factor is uniform in `1 +- brightness`.
     pub brightness: f32,
     /// Photometric changes of RGB crops.
@@ -208,6 +222,8 @@ impl Default for ProcessingConfig {
             joint_flip_p: 0.5,
             crop_flip_p: 0.5,
             grayscale_p: 0.05,
+            channel_mix_p: 0.0,
+            occluder_side: 0.6,
             brightness: 0.2,
             rgb: PhotometricConfig::default(),
             thermal: PhotometricConfig::default(),
@@ -234,6 +250,15 @@ pub struct PhotometricConfig {
     pub noise_p: f64,
     /// Largest standard deviation of the noise, in grey levels of 0..255.
     pub noise_sigma: f32,
+    /// Chance that grey values are stretched to fill the range, as a thermal camera's automatic gain
+    /// does.
+    pub window_p: f64,
+    /// Largest share of the pixels that the stretch clips, at each end.
+    pub window: f32,
+    /// Chance that a crop is smeared along a random direction.
+    pub motion_blur_p: f64,
+    /// Largest length of the smear, in crop pixels.
+    pub motion_blur: f32,
 }
 
 /// Loss weights (spec 2.5).

@@ -134,6 +134,8 @@ fn check_sampler(s: &SamplerConfig) -> Result<(), FieldError> {
     within("sampler.region_texture", s.region_texture.into(), 0.0, 10.0)?;
     within("sampler.min_target", s.min_target.into(), 1.0, 4096.0)?;
     count("sampler.gap", s.gap as u64, 1, 1_000_000)?;
+    share("sampler.distractor_p", s.distractor_p)?;
+    share("sampler.occluder_p", s.occluder_p)?;
     count("sampler.samples_per_epoch", s.samples_per_epoch as u64, 1, 1_000_000_000)
 }
 
@@ -150,7 +152,11 @@ fn check_photometric(name: &str, p: &PhotometricConfig) -> Result<(), FieldError
     share(&format!("processing.{name}.blur_p"), p.blur_p)?;
     within(&format!("processing.{name}.blur_sigma"), p.blur_sigma.into(), 0.0, 10.0)?;
     share(&format!("processing.{name}.noise_p"), p.noise_p)?;
-    within(&format!("processing.{name}.noise_sigma"), p.noise_sigma.into(), 0.0, 128.0)
+    within(&format!("processing.{name}.noise_sigma"), p.noise_sigma.into(), 0.0, 128.0)?;
+    share(&format!("processing.{name}.window_p"), p.window_p)?;
+    within(&format!("processing.{name}.window"), p.window.into(), 0.0, 0.4)?;
+    share(&format!("processing.{name}.motion_blur_p"), p.motion_blur_p)?;
+    within(&format!("processing.{name}.motion_blur"), p.motion_blur.into(), 0.0, 64.0)
 }
 
 fn check_processing(p: &ProcessingConfig) -> Result<(), FieldError> {
@@ -160,6 +166,8 @@ fn check_processing(p: &ProcessingConfig) -> Result<(), FieldError> {
     share("processing.joint_flip_p", p.joint_flip_p)?;
     share("processing.crop_flip_p", p.crop_flip_p)?;
     share("processing.grayscale_p", p.grayscale_p)?;
+    share("processing.channel_mix_p", p.channel_mix_p)?;
+    within("processing.occluder_side", p.occluder_side.into(), 0.1, 0.9)?;
     within("processing.brightness", p.brightness.into(), 0.0, 0.9)?;
     check_photometric("rgb", &p.rgb)?;
     check_photometric("thermal", &p.thermal)?;

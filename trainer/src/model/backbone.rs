@@ -84,7 +84,8 @@ impl FreezePolicy {
 
 /// One of the feature extractors of [`Backbone`].
 #[derive(Module, Debug)]
-#[allow(clippy::large_enum_variant)] // One per program.
+// One per program; the names are the networks' own.
+#[allow(clippy::large_enum_variant, clippy::enum_variant_names)]
 pub(crate) enum BackboneNet {
     /// See [`EfficientNetLite0`].
     EfficientNet(EfficientNetLite0),

@@ -128,6 +128,11 @@ pub struct Drawn {
     pub search: DrawnFrame,
     /// Is the target a random region?
     pub region: bool,
+    /// Target of another sequence, to be pasted beside this one; of the search frame's sensor.
+    pub distractor: Option<DrawnFrame>,
+    /// Frame of another sequence, part of which is to cover part of the target; of the search
+    /// frame's sensor.
+    pub occluder: Option<DrawnFrame>,
 }
 
 impl Drawn {
@@ -183,7 +188,11 @@ impl Sampler {
             let (p, labels) = (config.cross_modal_p, labels.join(", "));
             return Err(SampleError::NothingCrosses { p, labels });
         }
-        Ok(Self::from_sources(opened, config, cache))
+        let mut sampler = Self::from_sources(opened, config, cache);
+        if validation {
+            (sampler.config.distractor_p, sampler.config.occluder_p) = (0.0, 0.0);
+        }
+        Ok(sampler)
     }
 
     /// Sampler over sequences that are already open; `registered` allows random regions. `None`
@@ -240,7 +249,12 @@ impl Sampler {
             let Some(index) = self.mix.draw_source(cross, rng) else { break };
             for _ in 0..SEQUENCE_TRIES {
                 let Some((drawn, sequence)) = self.draw_from(index, cross, rng)? else { break };
-                if let Some(drawn) = drawn {
+                if let Some(mut drawn) = drawn {
+                    let modality = drawn.search.at.modality;
+                    drawn.distractor =
+                        self.draw_other(index, sequence, modality, self.config.distractor_p, rng)?;
+                    drawn.occluder =
+                        self.draw_other(index, sequence, modality, self.config.occluder_p, rng)?;
                     return Ok(drawn);
                 }
                 last = self.sources[index].sequences[sequence].id();
@@ -276,6 +290,39 @@ impl Sampler {
             }
         };
         Ok(Some((drawn, entry.sequence)))
+    }
+
+    /// With chance `p`, a frame of another sequence than `not` of the source, with a target seen by
+    /// `modality`. Of the same sequence it could be the very target, which would have two places.
+    fn draw_other(
+        &self,
+        index: usize,
+        not: usize,
+        modality: Modality,
+        p: f64,
+        rng: &mut impl Rng,
+    ) -> Result<Option<DrawnFrame>, SampleError> {
+        if p <= 0.0 || !rng.random_bool(p) {
+            return Ok(None);
+        }
+        let source = &self.sources[index];
+        for _ in 0..SEQUENCE_TRIES {
+            let Some(&place) = pick(&source.pool(false).targets, rng) else { break };
+            let entry = &source.entries[place];
+            let Some(target) = pick(&entry.targets, rng) else { continue };
+            if entry.sequence == not {
+                continue;
+            }
+            let clip = source.sequences[entry.sequence].as_ref();
+            let frame = rng.random_range(0..clip.frames().max(1));
+            let truth = clip.truth(target.index, frame, modality);
+            let Some(bbox) = truth.filter(|b| self.config.usable(b)) else { continue };
+            let drawn = self.frame(index, entry.sequence, frame, modality, bbox)?;
+            if drawn.is_some() {
+                return Ok(drawn);
+            }
+        }
+        Ok(None)
     }
 
     /// The frame with its picture; `None` when the box lies wholly outside of it.
@@ -325,7 +372,14 @@ impl Sampler {
             bbox.h
         );
         let templates = (0..self.config.templates).map(|_| of(template, &first)).collect();
-        Ok(Some(Drawn { id, templates, search: of(search, &second), region: true }))
+        Ok(Some(Drawn {
+            id,
+            templates,
+            search: of(search, &second),
+            region: true,
+            distractor: None,
+            occluder: None,
+        }))
     }
 
     fn draw_target(
@@ -371,7 +425,7 @@ impl Sampler {
             templates.push(drawn);
         }
         let Some(search) = of(search_frame, search)? else { return Ok(None) };
-        Ok(Some(Drawn { id, templates, search, region: false }))
+        Ok(Some(Drawn { id, templates, search, region: false, distractor: None, occluder: None }))
     }
 }
 
@@ -402,5 +456,7 @@ fn least_visible(config: &SamplerConfig) -> usize {
     2 * (config.templates + 1)
 }
 
+#[cfg(test)]
+mod mixed_tests;
 #[cfg(test)]
 mod tests;
