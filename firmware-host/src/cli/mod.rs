@@ -1,5 +1,6 @@
 //! The command line: what was typed ([`Cli`]) and what it does ([`execute`]).
 
+mod bench;
 #[cfg(feature = "eval")]
 mod calibrate;
 #[cfg(feature = "eval")]
@@ -69,6 +70,8 @@ pub enum Command {
     Info(InfoArgs),
     /// Check every engine of this build against the reference outputs stored in the bundle
     Verify(VerifyArgs),
+    /// Measure what a frame costs on each engine: time by stage, allocations, memory, load
+    Bench(bench::BenchArgs),
     /// Replay scripted runs through the tracker and compare every frame
     Replay(ReplayArgs),
     /// Evaluate a bundle on a dataset under cross-modal protocols
@@ -257,6 +260,7 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Track(args) => track::run(args),
         Command::Info(args) => info::run(args),
         Command::Verify(args) => verify::run(args),
+        Command::Bench(args) => bench::run(args),
         Command::Replay(args) => replay::run(args),
         #[cfg(feature = "eval")]
         Command::Eval(args) => eval::run(args),

@@ -23,7 +23,7 @@ pub use any::{AnyEngine, EngineChoice};
 #[cfg(feature = "native")]
 pub use native::{NativeEngine, NativeOptions};
 #[cfg(feature = "tract")]
-pub use tract::TractEngine;
+pub use tract::{TractEngine, TractOptions};
 
 use crate::spec::ModelSpec;
 

@@ -72,7 +72,7 @@ fn for_all(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: if cfg!(miri) { 2 } else { 40 }, ..ProptestConfig::default() })]
 
     /// A convolution with a border, bias, residual and limits; 1 x 1 is a linear layer.
     #[test]
