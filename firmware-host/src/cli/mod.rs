@@ -15,6 +15,7 @@ mod eval;
 mod info;
 #[cfg(feature = "eval")]
 mod presence;
+mod progress;
 mod render;
 mod replay;
 #[cfg(feature = "eval")]
@@ -39,7 +40,7 @@ use crate::engine::EngineArgs;
 use crate::error::HostError;
 use crate::redetect::RedetectArgs;
 use clap::{Args, Parser, Subcommand};
-use indicatif::{ProgressBar, ProgressStyle};
+use progress::progress_bar;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -297,20 +298,6 @@ fn stop_flag() -> &'static AtomicBool {
         });
     });
     &STOP
-}
-
-/// A progress bar on standard error, hidden when that is no terminal.
-fn progress_bar(total: Option<usize>, what: &'static str) -> ProgressBar {
-    let (bar, template) = match total {
-        Some(n) => {
-            (ProgressBar::new(n as u64), "{prefix} [{bar:30}] {pos}/{len} {msg} {eta_precise}")
-        }
-        None => (ProgressBar::new_spinner(), "{prefix} {pos} {msg}"),
-    };
-    if let Ok(style) = ProgressStyle::with_template(template) {
-        bar.set_style(style.progress_chars("=> "));
-    }
-    bar.with_prefix(what)
 }
 
 /// `12,345,678`.

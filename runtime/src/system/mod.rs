@@ -7,10 +7,12 @@
 
 mod clock;
 mod heap;
+mod map;
 #[cfg(feature = "pool")]
 mod pool;
 
 pub use clock::{peak_rss, process_cpu};
 pub use heap::{Counts, Heap, count};
+pub use map::Mapping;
 #[cfg(feature = "pool")]
 pub use pool::{PoolUsage, growing, is_installed, pool_usage, pooled, reserve};

@@ -31,7 +31,7 @@ fn run(
     // Twice: what a kernel leaves behind must not matter to the next run.
     let steps = vec![step.clone(), step.clone()];
     let program = Program::new(steps, arena, weights.len(), threads, k).unwrap();
-    let mut team = Team::new(arena, weights, vec![program], k, threads, false).unwrap();
+    let mut team = Team::new(arena, weights.to_vec(), vec![program], k, threads, false).unwrap();
     let all = team.view_mut(0..arena);
     all.fill(UNTOUCHED);
     all[..input.len()].copy_from_slice(input);
@@ -388,7 +388,7 @@ proptest! {
             })];
             for (kind, steps) in [("packed", packed), ("thin", thin)] {
                 let program = Program::new(steps, arena, 1, threads, k).unwrap();
-                let mut team = Team::new(arena, &[0.0], vec![program], k, threads, false).unwrap();
+                let mut team = Team::new(arena, vec![0.0], vec![program], k, threads, false).unwrap();
                 team.view_mut(0..input.len()).copy_from_slice(&input);
                 team.run(0);
                 let found = team.view(output..output + results);
