@@ -18,7 +18,7 @@ fn every_engine_gets_its_figures_or_a_reason() {
     let path = dir.path().join("bench.json");
     let file = path.to_str().expect("path");
     let mut args = vec!["--frames", "4", "--threads", "1,2", "--json", file];
-    for engine in ["native", "native,isa=scalar", "tract", "tract,pool=0", "ort"] {
+    for engine in ["native", "tract", "tract,pool=0", "ort"] {
         if cfg!(feature = "ort") || engine != "ort" {
             args.extend(["--engine", engine]);
         }
@@ -37,8 +37,7 @@ fn every_engine_gets_its_figures_or_a_reason() {
         let found = rows.iter().find(|r| r["engine"] == engine && r["threads"] == threads);
         found.unwrap_or_else(|| panic!("{engine} {threads}: {json}"))
     };
-    for (engine, threads) in [("native", 1), ("native", 2), ("native,isa=scalar", 1), ("tract", 1)]
-    {
+    for (engine, threads) in [("native", 1), ("native", 2), ("tract", 1)] {
         let row = row(engine, threads);
         let number = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key} in {row}"));
         assert!(row.get("unavailable").is_none() && row["preset"] == "nano", "{row}");

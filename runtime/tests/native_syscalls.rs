@@ -3,6 +3,7 @@
 //! marks. Without strace, or where it may not watch other processes, it says so and ends.
 
 use std::collections::BTreeMap;
+use std::io::Write as _;
 use std::process::Command;
 use tsda_runtime::bundle::BundleFile;
 use tsda_runtime::engine::native::{NativeEngine, NativeOptions};
@@ -66,6 +67,11 @@ fn between_marks(log: &str) -> BTreeMap<String, usize> {
     calls
 }
 
+/// A line in a single call: `eprintln` would make one more for its end.
+fn mark(text: &str) {
+    std::io::stderr().write_all(format!("{text}\n").as_bytes()).unwrap();
+}
+
 /// Tracks between the marks: both sensors, memory writes, frames without the target.
 fn track(threads: usize) {
     let file =
@@ -85,7 +91,7 @@ fn track(threads: usize) {
     let empty = FrameView::new(&plain, WIDTH / 2, HEIGHT, WIDTH, y16).unwrap();
     tracker.init(&rgb, BBox::new(130.0, 90.0, 48.0, 40.0), Some(Modality::Rgb)).unwrap();
     tracker.update(&rgb, Some(Modality::Rgb)).unwrap();
-    eprintln!("{BEGIN}");
+    mark(BEGIN);
     let mut writes = 0;
     for frame in 0..FRAMES {
         let (view, modality) = match frame % 20 {
@@ -95,6 +101,6 @@ fn track(threads: usize) {
         };
         writes += usize::from(tracker.update(view, Some(modality)).unwrap().wrote_memory);
     }
-    eprintln!("{END}");
+    mark(END);
     assert!(writes > 0, "no memory write was among the frames");
 }
