@@ -21,7 +21,7 @@ fn main() {
         return;
     }
     let log = std::env::temp_dir().join(format!("tsda-strace-{}", std::process::id()));
-    for threads in [1, 2, 3] {
+    for threads in [1, 2] {
         let output = Command::new("strace")
             .args(["-f", "-qq", "-o"])
             .arg(&log)

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Counts the system calls of 200 frames on the native engine with 1, 2 and 3 threads, under strace.
+# Counts the system calls of 200 frames on the native engine with 1 and 2 threads, under strace.
 # The test is part of `cargo test`; this runs it alone, and fetches strace with --install.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
