@@ -1,4 +1,4 @@
-//! Embeds `models/nano.tsda` when the repository has it; without it the program asks for `--bundle`.
+//! With feature `embed`: embeds `models/nano.tsda` when the repository has it; without it the program asks for `--bundle`.
 
 use std::path::PathBuf;
 use std::{env, fs, io};
@@ -12,7 +12,8 @@ fn main() -> io::Result<()> {
     // The folder is watched while there is no file, so that a new model is noticed.
     let watched = if model.is_file() { model.clone() } else { model.with_file_name("") };
     println!("cargo::rerun-if-changed={}", watched.display());
-    let value = if model.is_file() {
+    let embed = env::var_os("CARGO_FEATURE_EMBED").is_some();
+    let value = if embed && model.is_file() {
         format!("Some(include_bytes!({:?}))", model.canonicalize()?)
     } else {
         "None".to_owned()

@@ -92,6 +92,14 @@ pub enum HostError {
         /// What the engine said.
         source: Box<tsda_runtime::EngineError>,
     },
+    /// The process that measures an engine failed.
+    #[error("bench, {engine}: {reason}")]
+    Bench {
+        /// The engine.
+        engine: String,
+        /// What happened.
+        reason: String,
+    },
     /// The bundle's probe is missing or unusable.
     #[error("{}: {source}", bundle.display())]
     Probe {
@@ -143,6 +151,7 @@ impl HostError {
             | Self::Engine { .. }
             | Self::Timing { .. }
             | Self::ProbeRun { .. }
+            | Self::Bench { .. }
             | Self::Trax(_)
             | Self::Eval(_)
             | Self::Interrupted => EXIT_RUNTIME,

@@ -7,11 +7,13 @@
 //!    engine of [`engine`]'s arguments; [`redetect`]: whether a lost target's frame is scanned.
 //! 3. [`track`]: drives a tracker on any engine through a source into outputs.
 //! 4. [`video`]: GIF, page, PNG files, strip; [`metrics`]: figures against known boxes.
+//!    [`bench`]: what a frame costs.
 //! 5. [`replay`]: scripted runs, to check the tracker frame by frame.
 //! 6. [`trax`]: sessions with the VOT toolkit.
 //! 7. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
 //!    appear whole or not at all.
 
+pub mod bench;
 pub mod cli;
 pub mod engine;
 pub mod error;

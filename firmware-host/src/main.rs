@@ -6,6 +6,10 @@ use std::process::ExitCode;
 use tsda_host::cli::{Cli, execute};
 use tsda_host::error::one_line;
 
+/// Counts for `tsda bench` and lends tract its pool; otherwise the system's.
+#[global_allocator]
+static HEAP: tsda_runtime::system::Heap = tsda_runtime::system::Heap;
+
 fn main() -> ExitCode {
     // Usage errors end inside `parse`, with clap's code 2.
     match execute(&Cli::parse()) {

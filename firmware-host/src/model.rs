@@ -26,7 +26,7 @@ pub fn load(path: Option<&Path>) -> Result<BundleFile, HostError> {
         Some(path) => Ok(BundleFile::open(path)?),
         None => {
             let bytes = EMBEDDED.ok_or(HostError::NoEmbeddedModel)?;
-            Ok(BundleFile::from_bytes(EMBEDDED_NAME, bytes.to_vec())?)
+            Ok(BundleFile::from_static(EMBEDDED_NAME, bytes)?)
         }
     }
 }

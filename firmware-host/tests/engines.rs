@@ -33,7 +33,7 @@ fn unknown_engines_and_threads_are_refused() {
     let dir = tempfile::tempdir().expect("temp");
     for (args, words) in [
         (&["demo", "--engine", "abacus"][..], &["`abacus`", "tract"][..]),
-        (&["demo", "--engine", "tract,fast"], &["tract has no options"]),
+        (&["demo", "--engine", "tract,fast"], &["`fast`", "pool=MIB"]),
         (&["demo", "--engine", "tract", "--threads", "2"], &["--threads 2", "one thread"]),
         (&["verify", "--engine", "ort:gpu"], &["ort:gpu"]),
     ] {

@@ -25,6 +25,8 @@ pub mod memory;
 mod one_line;
 pub mod probe;
 pub mod spec;
+#[cfg(feature = "std")]
+pub mod system;
 #[cfg(test)]
 mod testing;
 pub mod tracker;

@@ -17,7 +17,7 @@ fn the_shipped_bundle_repeats_the_trainers_numbers() {
     let bundle = file.bundle().unwrap();
     let spec = bundle.manifest().spec;
     let probe = Probe::parse(bundle.require(SectionKind::Probe).unwrap(), &spec).unwrap();
-    let engines = [EngineChoice::Native(NativeOptions::default()), EngineChoice::Tract];
+    let engines = [EngineChoice::Native(NativeOptions::default()), "tract".parse().unwrap()];
     for choice in engines {
         let mut engine = choice.open(&bundle).unwrap();
         let report = probe::run(&mut engine, &probe).unwrap();

@@ -31,6 +31,9 @@ pub(super) fn run(args: &InfoArgs) -> Result<u8, HostError> {
         if let AnyEngine::Native(native) = &engine {
             print!("\n{}", native.plan_summary());
         }
+        if let Some(pool) = crate::bench::pool() {
+            println!("\n  {pool}");
+        }
     }
     Ok(EXIT_OK)
 }

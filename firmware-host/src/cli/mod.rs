@@ -1,5 +1,6 @@
 //! The command line: what was typed ([`Cli`]) and what it does ([`execute`]).
 
+mod bench;
 #[cfg(feature = "eval")]
 mod calibrate;
 #[cfg(feature = "eval")]
@@ -14,6 +15,7 @@ mod eval;
 mod info;
 #[cfg(feature = "eval")]
 mod presence;
+mod progress;
 mod render;
 mod replay;
 #[cfg(feature = "eval")]
@@ -38,7 +40,7 @@ use crate::engine::EngineArgs;
 use crate::error::HostError;
 use crate::redetect::RedetectArgs;
 use clap::{Args, Parser, Subcommand};
-use indicatif::{ProgressBar, ProgressStyle};
+use progress::progress_bar;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -69,6 +71,8 @@ pub enum Command {
     Info(InfoArgs),
     /// Check every engine of this build against the reference outputs stored in the bundle
     Verify(VerifyArgs),
+    /// Measure what a frame costs on each engine: time by stage, allocations, memory, load
+    Bench(bench::BenchArgs),
     /// Replay scripted runs through the tracker and compare every frame
     Replay(ReplayArgs),
     /// Evaluate a bundle on a dataset under cross-modal protocols
@@ -257,6 +261,7 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Track(args) => track::run(args),
         Command::Info(args) => info::run(args),
         Command::Verify(args) => verify::run(args),
+        Command::Bench(args) => bench::run(args),
         Command::Replay(args) => replay::run(args),
         #[cfg(feature = "eval")]
         Command::Eval(args) => eval::run(args),
@@ -293,20 +298,6 @@ fn stop_flag() -> &'static AtomicBool {
         });
     });
     &STOP
-}
-
-/// A progress bar on standard error, hidden when that is no terminal.
-fn progress_bar(total: Option<usize>, what: &'static str) -> ProgressBar {
-    let (bar, template) = match total {
-        Some(n) => {
-            (ProgressBar::new(n as u64), "{prefix} [{bar:30}] {pos}/{len} {msg} {eta_precise}")
-        }
-        None => (ProgressBar::new_spinner(), "{prefix} {pos} {msg}"),
-    };
-    if let Ok(style) = ProgressStyle::with_template(template) {
-        bar.set_style(style.progress_chars("=> "));
-    }
-    bar.with_prefix(what)
 }
 
 /// `12,345,678`.

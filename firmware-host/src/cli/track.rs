@@ -43,6 +43,9 @@ pub(super) fn run(args: &TrackArgs) -> Result<u8, HostError> {
         eprint!("{}", figures_table(&steps, &segments(&steps, &truth), &truth));
     }
     eprintln!("{}", speed_line(&steps));
+    if let Some(pool) = crate::bench::pool() {
+        eprintln!("{pool}");
+    }
     eprintln!("boxes: {}", args.out.display());
     for path in args.json.iter().filter(|p| *p != Path::new("-")).chain(&args.video_out) {
         eprintln!("also:  {}", path.display());

@@ -173,6 +173,9 @@ pub enum BundleError {
 pub struct Bundle<'a> {
     bytes: &'a [u8],
     manifest: Manifest<'a>,
+    /// What the bytes are a part of, when they are that of a mapped file.
+    #[cfg(feature = "std")]
+    mapping: Option<std::sync::Arc<crate::system::Mapping>>,
 }
 
 impl<'a> Bundle<'a> {
@@ -222,7 +225,18 @@ impl<'a> Bundle<'a> {
             calibration.validate()?;
         }
         check_sections(bytes, &manifest.sections, manifest_end)?;
-        Ok(Self { bytes, manifest })
+        Ok(Self {
+            bytes,
+            manifest,
+            #[cfg(feature = "std")]
+            mapping: None,
+        })
+    }
+
+    /// The mapped file that the bytes are a part of, if they are.
+    #[cfg(feature = "native")]
+    pub(crate) fn mapping(&self) -> Option<std::sync::Arc<crate::system::Mapping>> {
+        self.mapping.clone()
     }
 
     /// What the bundle says about itself.

@@ -8,7 +8,7 @@ use super::native::{Isa, NativeEngine, NativeOptions};
 #[cfg(feature = "ort")]
 use super::ort::{OrtEngine, OrtError, OrtLibrary, OrtOptions};
 #[cfg(feature = "tract")]
-use super::tract::TractEngine;
+use super::tract::{TractEngine, TractOptions};
 use super::{Engine, EngineError, Maps, TemplateInput};
 use crate::bundle::Bundle;
 use crate::spec::ModelSpec;
@@ -24,7 +24,7 @@ pub enum EngineChoice {
     Native(NativeOptions),
     /// tract.
     #[cfg(feature = "tract")]
-    Tract,
+    Tract(TractOptions),
     /// ONNX Runtime.
     #[cfg(feature = "ort")]
     Ort(OrtOptions),
@@ -82,7 +82,7 @@ impl Default for EngineChoice {
         }
         #[cfg(all(feature = "tract", not(feature = "native")))]
         {
-            Self::Tract
+            Self::Tract(TractOptions::default())
         }
         #[cfg(not(any(feature = "native", feature = "tract")))]
         {
@@ -98,7 +98,7 @@ impl EngineChoice {
             #[cfg(feature = "native")]
             Self::Native(NativeOptions::default()),
             #[cfg(feature = "tract")]
-            Self::Tract,
+            Self::Tract(TractOptions::default()),
             #[cfg(feature = "ort")]
             Self::Ort(OrtOptions::default()),
         ]
@@ -119,9 +119,9 @@ impl EngineChoice {
                 Ok(Self::Native(NativeOptions { threads, ..options }))
             }
             #[cfg(feature = "tract")]
-            Self::Tract if threads == 1 => Ok(self),
+            Self::Tract(_) if threads == 1 => Ok(self),
             #[cfg(feature = "tract")]
-            Self::Tract => Err(ChoiceError {
+            Self::Tract(_) => Err(ChoiceError {
                 text: self.to_string(),
                 reason: format!("it computes on one thread, {threads} were asked for"),
             }),
@@ -141,7 +141,9 @@ impl EngineChoice {
                 AnyEngine::Native(Box::new(NativeEngine::with_options(bundle, *options)?))
             }
             #[cfg(feature = "tract")]
-            Self::Tract => AnyEngine::Tract(Box::new(TractEngine::from_bundle(bundle)?)),
+            Self::Tract(options) => {
+                AnyEngine::Tract(Box::new(TractEngine::with_options(bundle, *options)?))
+            }
             #[cfg(feature = "ort")]
             Self::Ort(options) => {
                 AnyEngine::Ort(Box::new(OrtEngine::with_options(bundle, options)?))
@@ -162,7 +164,7 @@ impl EngineChoice {
                 options.threads
             ),
             #[cfg(feature = "tract")]
-            Self::Tract => "tract: pure Rust, compiled in, processor, one thread".into(),
+            Self::Tract(_) => format!("{self}: pure Rust, compiled in, processor, one thread"),
             #[cfg(feature = "ort")]
             Self::Ort(options) => {
                 let library = OrtLibrary::get()?;
@@ -216,6 +218,23 @@ fn native_options(text: &str) -> Result<NativeOptions, String> {
     Ok(options)
 }
 
+/// Reads `,pool=MIB`.
+#[cfg(feature = "tract")]
+fn tract_options(text: &str) -> Result<TractOptions, String> {
+    const KNOWN: &str = "only pool=MIB is";
+    let mut options = TractOptions::default();
+    if text.starts_with(':') {
+        return Err(format!("it has no providers; {KNOWN} possible after a comma"));
+    }
+    for part in text.split(',').skip(1) {
+        let Some(("pool", n)) = part.split_once('=') else {
+            return Err(format!("`{part}` is not known; {KNOWN}"));
+        };
+        options.pool_mib = Some(n.parse().map_err(|_| format!("`{n}` is no number of MiB"))?);
+    }
+    Ok(options)
+}
+
 impl FromStr for EngineChoice {
     type Err = ChoiceError;
 
@@ -226,9 +245,7 @@ impl FromStr for EngineChoice {
             #[cfg(feature = "native")]
             "native" => native_options(rest).map(Self::Native).map_err(fail),
             #[cfg(feature = "tract")]
-            "tract" if rest.is_empty() => Ok(Self::Tract),
-            #[cfg(feature = "tract")]
-            "tract" => Err(fail("tract has no options".into())),
+            "tract" => tract_options(rest).map(Self::Tract).map_err(fail),
             #[cfg(feature = "ort")]
             "ort" => OrtOptions::parse(rest).map(Self::Ort).map_err(fail),
             _ => {
@@ -255,7 +272,10 @@ impl fmt::Display for EngineChoice {
                 options.isa.map_or(Ok(()), |isa| write!(f, ",isa={}", isa.name()))
             }
             #[cfg(feature = "tract")]
-            Self::Tract => f.write_str("tract"),
+            Self::Tract(options) => {
+                f.write_str("tract")?;
+                options.pool_mib.map_or(Ok(()), |mib| write!(f, ",pool={mib}"))
+            }
             #[cfg(feature = "ort")]
             Self::Ort(options) => options.fmt(f),
         }
@@ -361,7 +381,13 @@ mod tests {
     #[cfg(feature = "tract")]
     #[test]
     fn tract_has_one_thread() {
-        let tract = EngineChoice::Tract;
+        let tract: EngineChoice = "tract".parse().unwrap();
+        for text in ["tract", "tract,pool=64", "tract,pool=0"] {
+            assert_eq!(text.parse::<EngineChoice>().unwrap().to_string(), text);
+        }
+        for text in ["tract,pool", "tract,pool=-1", "tract,fast"] {
+            assert!(text.parse::<EngineChoice>().is_err(), "{text}");
+        }
         assert_eq!(tract.clone().with_threads(1), Ok(tract.clone()));
         let error = tract.with_threads(2).unwrap_err();
         assert!(error.reason.contains("one thread, 2"), "{error}");

@@ -23,7 +23,7 @@ pub use any::{AnyEngine, EngineChoice};
 #[cfg(feature = "native")]
 pub use native::{NativeEngine, NativeOptions};
 #[cfg(feature = "tract")]
-pub use tract::TractEngine;
+pub use tract::{TractEngine, TractOptions};
 
 use crate::spec::ModelSpec;
 
@@ -65,7 +65,7 @@ pub trait Engine {
 
 /// Shape of a template slot, as the `template` graph declares its output `tokens`: one row per cell
 /// and one or several blocks of the network's width. What the blocks are is the graphs' own affair.
-#[cfg(any(feature = "native", feature = "tract", feature = "ort"))]
+#[cfg(any(feature = "tract", feature = "ort"))]
 fn slot_shape(
     engine: &'static str,
     spec: &ModelSpec,

@@ -6,18 +6,29 @@
 use super::{Engine, EngineError, Maps, Stage, TemplateInput, slot_shape};
 use crate::bundle::{Bundle, SectionKind, WEIGHTS_FILE};
 use crate::spec::ModelSpec;
+use crate::system::{growing, is_installed, pooled, reserve};
 use tract_onnx::pb::{self, tensor_proto, tensor_shape_proto::dimension, type_proto};
 use tract_onnx::prelude::*;
 
 const NAME: &str = "tract";
 
+/// How to run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TractOptions {
+    /// Size in MiB of the pool ([`crate::system`]) that tract's allocations come from; `None` finds
+    /// it by a trial run at load, 0 leaves them to the system.
+    pub pool_mib: Option<usize>,
+}
+
 /// A bundle's network on tract, single-threaded.
 ///
 /// Inputs and results are copied once between tract's tensors and the engine's buffers (about a
-/// thousandth of a frame's time); tract itself allocates while it computes.
+/// thousandth of a frame's time). tract itself allocates while it computes: from a pool, in programs
+/// whose allocator is [`crate::system::Heap`].
 #[derive(Debug)]
 pub struct TractEngine {
     spec: ModelSpec,
+    pooled: bool,
     features: Graph,
     template: Graph,
     /// Index `k - 1`: for `k` templates.
@@ -38,6 +49,48 @@ impl TractEngine {
     /// When a graph is missing, does not fit the specification, refers to weights outside the
     /// weights section, or tract cannot run it. The message names graph and tensor.
     pub fn from_bundle(bundle: &Bundle<'_>) -> Result<Self, EngineError> {
+        Self::with_options(bundle, TractOptions::default())
+    }
+
+    /// Loads and optimises the graphs of a bundle.
+    ///
+    /// # Errors
+    /// As [`Self::from_bundle`]; also when there is no memory for the pool.
+    pub fn with_options(bundle: &Bundle<'_>, options: TractOptions) -> Result<Self, EngineError> {
+        let mut engine = Self::load(bundle)?;
+        match options.pool_mib {
+            Some(mib) => {
+                let bytes = mib.checked_mul(1 << 20);
+                if is_installed() && !bytes.is_some_and(reserve) {
+                    let detail = format_args!("no memory for a pool of {mib} MiB; ask for less");
+                    return Err(error(Stage::Load, detail));
+                }
+                engine.pooled = mib > 0;
+            }
+            None => {
+                engine.pooled = is_installed();
+                if engine.pooled {
+                    growing(|| engine.trial())?;
+                }
+            }
+        }
+        Ok(engine)
+    }
+
+    /// Does everything that a frame may do, so that the pool gets the size it needs.
+    fn trial(&mut self) -> Result<(), EngineError> {
+        let slots = self.tokens.len();
+        self.run_features()?;
+        (0..slots).try_for_each(|slot| self.run_template(slot))?;
+        (1..=slots).try_for_each(|filled| self.run_predict(filled))?;
+        // Again with everything in place, which is how frames find it.
+        self.run_features()?;
+        self.feature = None;
+        self.tokens.fill(None);
+        Ok(())
+    }
+
+    fn load(bundle: &Bundle<'_>) -> Result<Self, EngineError> {
         let spec = bundle.manifest().spec;
         let (side, map, width) = (spec.crop_side(), spec.map_side(), usize::from(spec.width));
         let cells = spec.cells();
@@ -73,6 +126,7 @@ impl TractEngine {
             .collect::<Result<Vec<_>, _>>()?;
         Ok(Self {
             spec,
+            pooled: false,
             features,
             template,
             predict,
@@ -93,20 +147,8 @@ impl TractEngine {
     }
 }
 
-impl Engine for TractEngine {
-    fn spec(&self) -> &ModelSpec {
-        &self.spec
-    }
-
-    fn name(&self) -> &'static str {
-        NAME
-    }
-
-    fn crop_mut(&mut self) -> &mut [f32] {
-        &mut self.crop
-    }
-
-    fn features(&mut self) -> Result<(), EngineError> {
+impl TractEngine {
+    fn run_features(&mut self) -> Result<(), EngineError> {
         // Whatever was there belongs to an older crop.
         self.feature = None;
         let crop = self.features.input(0, &self.crop, Stage::Features)?;
@@ -115,11 +157,7 @@ impl Engine for TractEngine {
         Ok(())
     }
 
-    fn template_input_mut(&mut self) -> TemplateInput<'_> {
-        TemplateInput { label: &mut self.label, ltrb: &mut self.ltrb }
-    }
-
-    fn write_template(&mut self, slot: usize) -> Result<(), EngineError> {
+    fn run_template(&mut self, slot: usize) -> Result<(), EngineError> {
         let stage = Stage::Template;
         let slots = self.tokens.len();
         if slot >= slots {
@@ -135,7 +173,7 @@ impl Engine for TractEngine {
         Ok(())
     }
 
-    fn predict(&mut self, filled: usize) -> Result<Maps<'_>, EngineError> {
+    fn run_predict(&mut self, filled: usize) -> Result<(), EngineError> {
         let stage = Stage::Predict;
         let slots = self.tokens.len();
         let feature = self.feature(stage)?;
@@ -151,7 +189,45 @@ impl Engine for TractEngine {
         inputs.push(feature);
         let [scores, ltrb] = graph.run(inputs, stage)?;
         read(&scores, &mut self.scores)?;
-        read(&ltrb, &mut self.ltrb_map)?;
+        read(&ltrb, &mut self.ltrb_map)
+    }
+
+    /// Does some work with tract's memory where it is to be.
+    fn inside(
+        &mut self,
+        work: impl FnOnce(&mut Self) -> Result<(), EngineError>,
+    ) -> Result<(), EngineError> {
+        if self.pooled { pooled(|| work(self)) } else { work(self) }
+    }
+}
+
+impl Engine for TractEngine {
+    fn spec(&self) -> &ModelSpec {
+        &self.spec
+    }
+
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn crop_mut(&mut self) -> &mut [f32] {
+        &mut self.crop
+    }
+
+    fn features(&mut self) -> Result<(), EngineError> {
+        self.inside(Self::run_features)
+    }
+
+    fn template_input_mut(&mut self) -> TemplateInput<'_> {
+        TemplateInput { label: &mut self.label, ltrb: &mut self.ltrb }
+    }
+
+    fn write_template(&mut self, slot: usize) -> Result<(), EngineError> {
+        self.inside(|engine| engine.run_template(slot))
+    }
+
+    fn predict(&mut self, filled: usize) -> Result<Maps<'_>, EngineError> {
+        self.inside(|engine| engine.run_predict(filled))?;
         Ok(Maps { scores: &self.scores, ltrb: &self.ltrb_map })
     }
 }

@@ -164,7 +164,7 @@ impl NativeEngine {
         let spec = bundle.manifest().spec;
         let graphs = Graphs::read(bundle, spec.templates)?;
         let weights = bundle.section(SectionKind::Weights).unwrap_or_default().len() / 4;
-        let mut planner = Planner::new(kernels, threads, weights + weights / 16);
+        let mut planner = Planner::new(kernels, threads, weights + weights / 16, bundle.mapping());
         let places = Self::lower(&mut planner, &spec, &graphs)?;
         let plan = planner.finish().map_err(|e| error(Stage::Load, format_args!("{e}")))?;
         drop(graphs);
@@ -178,7 +178,7 @@ impl NativeEngine {
             lasting: 4 * lasting,
             programs: summaries,
         };
-        let mut team = Team::new(arena, &weights, programs, kernels, threads, options.pin)
+        let mut team = Team::new(arena, weights, programs, kernels, threads, options.pin)
             .map_err(|e| error(Stage::Load, format_args!("{e}")))?;
         // What depends on constants only.
         team.run(0);

@@ -29,7 +29,7 @@ impl GraphSession {
         let Some(kernels) = Isa::best().kernels() else {
             return Err(failed(&"this processor has no kernels"));
         };
-        let mut planner = Planner::new(kernels, 1, onnx.len() / 4);
+        let mut planner = Planner::new(kernels, 1, onnx.len() / 4, None);
         let mut place = |ids: &[usize]| -> Vec<(String, Range<usize>, View)> {
             ids.iter()
                 .map(|&id| {
@@ -49,7 +49,7 @@ impl GraphSession {
         planner.add("graph", &graph, &from, &to).map_err(|e| failed(&e))?;
         let Plan { programs, weights, arena, .. } = planner.finish().map_err(|e| failed(&e))?;
         let mut team =
-            Team::new(arena, &weights, programs, kernels, 1, false).map_err(|e| failed(&e))?;
+            Team::new(arena, weights, programs, kernels, 1, false).map_err(|e| failed(&e))?;
         team.run(CONSTANTS);
         let named = |ports: Vec<(String, Range<usize>, View)>| {
             ports.into_iter().map(|(name, range, _)| (name, range)).collect()

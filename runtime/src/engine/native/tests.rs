@@ -324,13 +324,13 @@ fn evaluate(bytes: &[u8], x: (&[usize], &[f32]), y: &[usize]) -> Vec<f32> {
     let mut graph = graph::read(bytes, &[]).unwrap();
     graph::fuse(&mut graph);
     let kernels = Isa::best().kernels().unwrap();
-    let mut planner = Planner::new(kernels, 2, 0);
+    let mut planner = Planner::new(kernels, 2, 0, None);
     let (from, to) = (planner.lasting(x.1.len()), planner.lasting(y.iter().product()));
     let bind =
         |name, at, shape: &[usize]| Binding { name, view: View::dense(Base::Arena(at), shape) };
     planner.add("test", &graph, &[bind("x", from, x.0)], &[bind("y", to, y)]).unwrap();
     let plan = planner.finish().unwrap();
-    let mut team = Team::new(plan.arena, &plan.weights, plan.programs, kernels, 2, false).unwrap();
+    let mut team = Team::new(plan.arena, plan.weights, plan.programs, kernels, 2, false).unwrap();
     team.view_mut(from..from + x.1.len()).copy_from_slice(x.1);
     team.run(0);
     team.run(1);

@@ -39,7 +39,7 @@ impl Block {
 /// What all threads see.
 struct Shared {
     arena: Block,
-    weights: Block,
+    weights: Vec<f32>,
     programs: Box<[Program]>,
     kernels: &'static Kernels,
     threads: usize,
@@ -52,8 +52,7 @@ struct Shared {
 
 const STOP: usize = usize::MAX;
 
-// SAFETY: the blocks are the only parts that are not `Sync` by themselves. Weights are written
-// before the threads start. The arena is touched by threads only during `Team::run`, which holds
+// SAFETY: the arena is the only part that is not `Sync` by itself. It is touched by threads only during `Team::run`, which holds
 // the team exclusively, and then every thread writes places of its own, as `Program::new` has
 // checked; between steps that depend on each other the threads wait for each other.
 unsafe impl Sync for Shared {}
@@ -63,7 +62,7 @@ unsafe impl Send for Shared {}
 impl Shared {
     /// One thread's part of a program.
     fn work(&self, program: usize, id: usize) {
-        let mem = Mem { arena: self.arena.start(), weights: self.weights.start() };
+        let mem = Mem { arena: self.arena.start(), weights: self.weights.as_ptr() };
         let part = Part { id, of: self.threads };
         let program = &self.programs[program];
         // SAFETY: the program was checked against memory of this size and this number of threads,
@@ -104,21 +103,15 @@ impl Team {
     /// When a program was checked for other sizes, or a thread cannot be started.
     pub fn new(
         arena: usize,
-        weights: &[f32],
+        weights: Vec<f32>,
         programs: Vec<Program>,
         kernels: &'static Kernels,
         threads: usize,
         pin: bool,
     ) -> Result<Self, String> {
-        let weights_block = Block::zeroed(weights.len());
-        // SAFETY: the block is as long as the slice or longer and was just made.
-        unsafe {
-            let to = weights_block.start();
-            core::ptr::copy_nonoverlapping(weights.as_ptr(), to, weights.len());
-        }
         let arena = Block::zeroed(arena);
         for program in &programs {
-            if !program.fits(arena.len(), weights_block.len(), threads, kernels) {
+            if !program.fits(arena.len(), weights.len(), threads, kernels) {
                 return Err(
                     "a program for another arena, instruction set or number of threads".into()
                 );
@@ -126,7 +119,7 @@ impl Team {
         }
         let shared = Arc::new(Shared {
             arena,
-            weights: weights_block,
+            weights,
             programs: programs.into(),
             kernels,
             threads,

@@ -19,6 +19,9 @@ fn numbers(len: usize, seed: usize) -> Vec<f32> {
 /// Marks what no kernel may touch.
 const UNTOUCHED: f32 = 12345.0;
 
+/// Bound of the number of queries; Miri takes minutes for more.
+const QUERIES: usize = if cfg!(miri) { 5 } else { 35 };
+
 /// Runs a step on an arena that starts with `input` and is `UNTOUCHED` behind it.
 fn run(
     step: &Step,
@@ -31,7 +34,7 @@ fn run(
     // Twice: what a kernel leaves behind must not matter to the next run.
     let steps = vec![step.clone(), step.clone()];
     let program = Program::new(steps, arena, weights.len(), threads, k).unwrap();
-    let mut team = Team::new(arena, weights, vec![program], k, threads, false).unwrap();
+    let mut team = Team::new(arena, weights.to_vec(), vec![program], k, threads, false).unwrap();
     let all = team.view_mut(0..arena);
     all.fill(UNTOUCHED);
     all[..input.len()].copy_from_slice(input);
@@ -72,7 +75,7 @@ fn for_all(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: if cfg!(miri) { 2 } else { 40 }, ..ProptestConfig::default() })]
 
     /// A convolution with a border, bias, residual and limits; 1 x 1 is a linear layer.
     #[test]
@@ -328,7 +331,7 @@ proptest! {
     /// Packed and thin attention give the same, with heads side by side.
     #[test]
     fn attention_of_any_size(
-        (heads, queries, keys) in (1usize..4, 1usize..30, 1usize..70),
+        (heads, queries, keys) in (1usize..4, 1usize..QUERIES, 1usize..2 * QUERIES),
         (key, value, threads) in (1usize..37, 1usize..37, 1usize..4),
     ) {
         let (qs, ks, vs) = (queries * heads * key, keys * heads * key, keys * heads * value);
@@ -388,7 +391,7 @@ proptest! {
             })];
             for (kind, steps) in [("packed", packed), ("thin", thin)] {
                 let program = Program::new(steps, arena, 1, threads, k).unwrap();
-                let mut team = Team::new(arena, &[0.0], vec![program], k, threads, false).unwrap();
+                let mut team = Team::new(arena, vec![0.0], vec![program], k, threads, false).unwrap();
                 team.view_mut(0..input.len()).copy_from_slice(&input);
                 team.run(0);
                 let found = team.view(output..output + results);

@@ -264,7 +264,9 @@ impl Lower<'_, '_, '_> {
     /// Elements and source of a constant.
     fn constant(&self, id: usize) -> Try<(Vec<f32>, super::Source)> {
         let data = self.graph.values[id].data.as_ref().ok_or("an operand is not constant")?;
-        Ok((data.floats(), source(self.index, id, data)))
+        let floats = data.floats();
+        self.planner.release(data);
+        Ok((floats, source(self.index, id, data)))
     }
 
     /// The view with constants placed in the weights, as they are.

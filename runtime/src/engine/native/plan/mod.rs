@@ -12,8 +12,10 @@ mod view;
 
 use super::graph::{Data, Graph, GraphError};
 use super::kernels::{Halo, Kernels, Program, Step};
+use crate::system::Mapping;
 use arena::Life;
 use std::collections::HashMap;
+use std::sync::Arc;
 pub use view::{Base, View};
 
 /// Buffers, weights and lines start at multiples of this many floats, a cache line.
@@ -101,6 +103,10 @@ pub struct Planner {
     kernels: &'static Kernels,
     threads: usize,
     weights: Vec<f32>,
+    /// Index of the first weight that lies at the start of a cache line, as all tensors then do.
+    origin: usize,
+    /// The file that constants are read from, when it is mapped.
+    mapping: Option<Arc<Mapping>>,
     made: HashMap<Made, usize>,
     lasting: usize,
     /// Computed once, from constants only.
@@ -112,12 +118,23 @@ pub struct Planner {
 
 impl Planner {
     /// For an instruction set and a number of threads. `weights` is about how many floats there
-    /// will be.
-    pub fn new(kernels: &'static Kernels, threads: usize, weights: usize) -> Self {
+    /// will be; `mapping` the file they come from, which gets its memory back piece by piece.
+    pub fn new(
+        kernels: &'static Kernels,
+        threads: usize,
+        weights: usize,
+        mapping: Option<Arc<Mapping>>,
+    ) -> Self {
+        let mut weights: Vec<f32> = Vec::with_capacity(weights + ALIGN);
+        // Where that cannot be said, it is all the same: kernels work with any alignment.
+        let origin = Some(weights.as_ptr().align_offset(4 * ALIGN)).filter(|&n| n < ALIGN);
+        weights.resize(origin.unwrap_or(0), 0.0);
         Self {
             kernels,
             threads,
-            weights: Vec::with_capacity(weights),
+            origin: weights.len(),
+            weights,
+            mapping,
             made: HashMap::new(),
             lasting: 0,
             once: Default::default(),
@@ -220,10 +237,17 @@ impl Planner {
         Ok(plan)
     }
 
+    /// Says that a constant has been read; it can be read again.
+    fn release(&self, data: &Data<'_>) {
+        if let (Some(mapping), Data::Bytes(bytes)) = (&self.mapping, data) {
+            mapping.release(bytes);
+        }
+    }
+
     /// Appends to the weights; the place.
     fn put(&mut self, values: &[f32]) -> usize {
-        self.weights.resize(self.weights.len().next_multiple_of(ALIGN), 0.0);
-        let at = self.weights.len();
+        let at = self.origin + (self.weights.len() - self.origin).next_multiple_of(ALIGN);
+        self.weights.resize(at, 0.0);
         self.weights.extend_from_slice(values);
         at
     }
