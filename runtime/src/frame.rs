@@ -122,9 +122,7 @@ impl<'a> FrameView<'a> {
         let row = match format {
             PixelFormat::Rgb8 | PixelFormat::Bgr8 => width.checked_mul(3),
             PixelFormat::Gray8 | PixelFormat::Nv12 => Some(width),
-            PixelFormat::Y16 { .. } | PixelFormat::Yuyv | PixelFormat::Uyvy => {
-                width.checked_mul(2)
-            },
+            PixelFormat::Y16 { .. } | PixelFormat::Yuyv | PixelFormat::Uyvy => width.checked_mul(2),
         }
         .ok_or(overflow)?;
         if stride < row {

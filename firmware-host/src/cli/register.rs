@@ -29,10 +29,8 @@ pub struct RegisterArgs {
 
 pub(super) fn run(args: &RegisterArgs) -> Result<u8, HostError> {
     let pairs = read(&args.pairs)?;
-    let bad = |reason: String| HostError::Argument {
-        what: args.pairs.display().to_string(),
-        reason,
-    };
+    let bad =
+        |reason: String| HostError::Argument { what: args.pairs.display().to_string(), reason };
     let (found, used) = match args.robust {
         Some(tolerance) if tolerance.is_finite() && tolerance > 0.0 => {
             Homography::estimate_robust(&pairs, tolerance).map_err(|e| bad(e.to_string()))?
@@ -83,9 +81,8 @@ fn read(path: &Path) -> Result<Vec<Pair>, HostError> {
         .map_err(|source| SourceError::Io { path: path.to_path_buf(), source })?;
     let mut pairs = Vec::new();
     for (i, line) in text.lines().enumerate() {
-        let bad = |reason: String| {
-            SourceError::Line { path: path.to_path_buf(), line: i + 1, reason }
-        };
+        let bad =
+            |reason: String| SourceError::Line { path: path.to_path_buf(), line: i + 1, reason };
         let line = line.split('#').next().unwrap_or_default();
         let mut numbers = Vec::with_capacity(4);
         for word in line.split([' ', '\t', ',', ';']).filter(|w| !w.is_empty()) {

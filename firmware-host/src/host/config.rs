@@ -3,9 +3,9 @@
 use super::clock::ClockKind;
 use super::source::Fault;
 use crate::error::HostError;
+use crate::switch::HealthLimits;
 use crate::switch::homography::Homography;
 use crate::switch::policy::SceneMeasure;
-use crate::switch::HealthLimits;
 use crate::thermal::{AgcOptions, Profile};
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -102,6 +102,9 @@ pub struct V4l2Config {
     /// Buffers in the driver.
     #[serde(default = "four")]
     pub buffers: u32,
+    /// Wait for a camera that is not there at the start, instead of refusing to run.
+    #[serde(default)]
+    pub wait: bool,
     /// Controls by name, set at every start.
     #[serde(default)]
     pub controls: BTreeMap<String, i64>,

@@ -188,7 +188,9 @@ fn serve(
 }
 
 fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), HostError> {
-    thread::Builder::new().name(name.into()).spawn(work).map(drop).map_err(|source| {
-        HostError::Create { path: name.into(), source }
-    })
+    thread::Builder::new()
+        .name(name.into())
+        .spawn(work)
+        .map(drop)
+        .map_err(|source| HostError::Create { path: name.into(), source })
 }

@@ -2,9 +2,7 @@
 
 use super::config::JsonConfig;
 use super::control::SocketFile;
-use super::output::{
-    Event, EventKind, Feeder, FrameRecord, Output, SourceInfo, Views, queue,
-};
+use super::output::{Event, EventKind, Feeder, FrameRecord, Output, SourceInfo, Views, queue};
 use crate::error::HostError;
 use crate::thermal::Temperature;
 use serde::Serialize;
@@ -31,7 +29,11 @@ enum Way {
     /// Events only, as text.
     Stderr,
     Udp(UdpSocket),
-    Unix { listener: UnixListener, clients: Vec<UnixStream>, _file: SocketFile },
+    Unix {
+        listener: UnixListener,
+        clients: Vec<UnixStream>,
+        _file: SocketFile,
+    },
 }
 
 /// JSON lines.
@@ -78,10 +80,7 @@ impl JsonLines {
             _ => {
                 return Err(HostError::Argument {
                     what: "output.json.to".into(),
-                    reason: format!(
-                        "`{}` is none of stdout, udp:HOST:PORT, unix:PATH",
-                        config.to
-                    ),
+                    reason: format!("`{}` is none of stdout, udp:HOST:PORT, unix:PATH", config.to),
                 });
             }
         };

@@ -96,7 +96,9 @@ impl Plan {
         };
         let given = match config.target.bbox {
             Some([x, y, w, h]) if BBox::new(x, y, w, h).is_valid() => Some(BBox::new(x, y, w, h)),
-            Some(b) => return refuse("target.box", format!("{b:?} is no box: x, y, width, height")),
+            Some(b) => {
+                return refuse("target.box", format!("{b:?} is no box: x, y, width, height"));
+            }
             None => None,
         };
         let text = config.engine.as_deref().unwrap_or_default();
@@ -260,10 +262,7 @@ fn open_camera(
 }
 
 #[cfg(not(feature = "camera"))]
-fn open_camera(
-    name: &str,
-    _: &super::config::V4l2Config,
-) -> Result<Box<dyn Source>, HostError> {
+fn open_camera(name: &str, _: &super::config::V4l2Config) -> Result<Box<dyn Source>, HostError> {
     refuse(
         format!("source `{name}`.v4l2"),
         "this program was built without cameras; build it with `--features camera` (docs/board.md)",
@@ -334,8 +333,10 @@ fn load(source: &mut dyn FrameSource) -> Result<Vec<Held>, HostError> {
     Ok(pictures)
 }
 
-/// First raw value of a drawn 16-bit picture (20 degrees Celsius in 0.01 K) and steps per grey level.
-const DRAWN_RAW: (u16, u16) = (29_315, 8);
+/// Raw value of black in a drawn 16-bit picture: 20 degrees Celsius in steps of 0.01 K.
+pub const RAW_FIRST: u16 = 29_315;
+/// Raw steps per grey level.
+pub const RAW_STEP: u16 = 8;
 
 /// Draws the whole scene beforehand: drawing takes longer than tracking.
 fn render(drawn: &RenderConfig, sensor: Modality, rate: f64) -> Reel {
@@ -353,7 +354,7 @@ fn render(drawn: &RenderConfig, sensor: Modality, rate: f64) -> Reel {
         if let Ok(view) = picture.view() {
             let mut held = Held::of(&view);
             if drawn.raw16 && sensor == Modality::Thermal {
-                held.widen(DRAWN_RAW.0, DRAWN_RAW.1);
+                held.widen(RAW_FIRST, RAW_STEP);
             }
             pictures.push(held);
         }

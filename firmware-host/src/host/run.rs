@@ -177,16 +177,13 @@ impl<E: Engine> Host<E> {
     /// # Errors
     /// A source or an engine that cannot go on. The outputs are finished all the same.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<Summary, HostError> {
-        if let Clock::Wall(start) = &mut self.clock {
-            *start = Instant::now();
-        }
-        self.event(EventKind::Started);
+        self.start();
         let ending = loop {
             if stop.load(Ordering::Relaxed) {
                 break Ok(Ending::Signal);
             }
             match self.step() {
-                Ok(None) => self.clock.tick(),
+                Ok(None) => self.tick(),
                 Ok(Some(ending)) => break Ok(ending),
                 Err(e) => break Err(e),
             }
@@ -197,6 +194,20 @@ impl<E: Engine> Host<E> {
             output.finish();
         }
         Ok(self.summary(ending?))
+    }
+
+    /// Begins the time of the run, for a caller with a loop of its own around [`Self::step`] and
+    /// [`Self::tick`].
+    pub fn start(&mut self) {
+        if let Clock::Wall(start) = &mut self.clock {
+            *start = Instant::now();
+        }
+        self.event(EventKind::Started);
+    }
+
+    /// Lets the time go on by a frame, where it goes by frames.
+    pub fn tick(&mut self) {
+        self.clock.tick();
     }
 
     /// One turn of the loop; answers why the run has to end, if it has to.
@@ -290,7 +301,9 @@ impl<E: Engine> Host<E> {
                 match at {
                     Some(None) => self.event(unknown(&source.unwrap_or_default())),
                     _ if !b.is_valid() => self.event(EventKind::Refused {
-                        what: format!("box {x}, {y}, {w}, {h}: width and height have to be positive"),
+                        what: format!(
+                            "box {x}, {y}, {w}, {h}: width and height have to be positive"
+                        ),
                     }),
                     at => self.pending = Some((at.flatten().unwrap_or(self.active), b)),
                 }

@@ -122,8 +122,8 @@ impl Sensor {
             reason,
         };
         let Some(captured) = self.source.frame() else { return Ok(false) };
-        let whole = cropped(&captured.view, self.crop)
-            .map_err(|reason| fail(&self.info.name, reason))?;
+        let whole =
+            cropped(&captured.view, self.crop).map_err(|reason| fail(&self.info.name, reason))?;
         let sixteen = matches!(whole.format(), PixelFormat::Y16 { .. });
         let shape = (whole.width(), whole.height(), sixteen, captured.full);
         if self.shape != Some(shape) {
@@ -141,9 +141,9 @@ impl Sensor {
         }
         let status = self.thermal.as_ref().map(|t| t.status(&whole)).unwrap_or_default();
         let picture = match &self.thermal {
-            Some(thermal) => thermal
-                .picture(&whole)
-                .map_err(|e| fail(&self.info.name, e.to_string()))?,
+            Some(thermal) => {
+                thermal.picture(&whole).map_err(|e| fail(&self.info.name, e.to_string()))?
+            }
             None => whole,
         };
         let marks =
@@ -180,10 +180,7 @@ impl Sensor {
 }
 
 /// Part of a picture, without copying. Planar formats cannot be cut this way.
-fn cropped<'a>(
-    view: &FrameView<'a>,
-    crop: Option<[usize; 4]>,
-) -> Result<FrameView<'a>, String> {
+fn cropped<'a>(view: &FrameView<'a>, crop: Option<[usize; 4]>) -> Result<FrameView<'a>, String> {
     let Some([x, y, w, h]) = crop else { return Ok(*view) };
     let (width, height, format) = (view.width(), view.height(), view.format());
     let fits = x.checked_add(w).is_some_and(|r| r <= width)

@@ -143,7 +143,7 @@ impl Watch {
         } else {
             Condition::Good
         };
-        if self.picture == Condition::Good {
+        if self.picture == Condition::Good && new {
             self.good = Some(now);
         }
         new

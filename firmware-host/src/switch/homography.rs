@@ -126,12 +126,7 @@ impl Homography {
         let (wide, high) = (a.abs() * w + b.abs() * h, c.abs() * w + d.abs() * h);
         let shrink = ((a * d - b * c).abs() * w * h / (wide * high).max(1e-12)).sqrt();
         let (wide, high) = (wide * shrink, high * shrink);
-        BBox::new(
-            (u - wide * 0.5) as f32,
-            (v - high * 0.5) as f32,
-            wide as f32,
-            high as f32,
-        )
+        BBox::new((u - wide * 0.5) as f32, (v - high * 0.5) as f32, wide as f32, high as f32)
     }
 
     /// A velocity at a point, in the other picture.
@@ -201,9 +196,8 @@ impl Homography {
         if pairs.len() < MIN_PAIRS {
             return Err(RegistrationError::TooFew { got: pairs.len() });
         }
-        let agreeing = |h: &Self| -> Vec<bool> {
-            pairs.iter().map(|p| h.residual(p) <= tolerance).collect()
-        };
+        let agreeing =
+            |h: &Self| -> Vec<bool> { pairs.iter().map(|p| h.residual(p) <= tolerance).collect() };
         let count = |used: &[bool]| used.iter().filter(|u| **u).count();
         let mut best: Option<Vec<bool>> = None;
         let mut state = 0x9E37_79B9_7F4A_7C15u64;
@@ -262,7 +256,8 @@ fn eigen(mut a: [[f64; 9]; 9]) -> ([f64; 9], [[f64; 9]; 9]) {
     let mut v: [[f64; 9]; 9] =
         std::array::from_fn(|r| std::array::from_fn(|c| f64::from(u8::from(r == c))));
     for _ in 0..60 {
-        let off: f64 = (0..9).flat_map(|r| (0..r).map(move |c| (r, c))).map(|(r, c)| a[r][c].powi(2)).sum();
+        let off: f64 =
+            (0..9).flat_map(|r| (0..r).map(move |c| (r, c))).map(|(r, c)| a[r][c].powi(2)).sum();
         if off < 1e-28 {
             break;
         }

@@ -152,8 +152,9 @@ impl Policy {
         if !self.automatic || self.failed_over {
             return None;
         }
-        let usable =
-            |to: usize| to != active && watches.get(to).is_some_and(|w| w.condition(now) == Condition::Good);
+        let usable = |to: usize| {
+            to != active && watches.get(to).is_some_and(|w| w.condition(now) == Condition::Good)
+        };
         if let Some(to) = planned.filter(|to| usable(*to)) {
             return Some((to, Reason::Schedule));
         }
@@ -162,7 +163,8 @@ impl Policy {
 
     fn scheduled(&mut self, now: Duration, active: usize, sensors: usize) -> Option<usize> {
         let mut to = None;
-        while let Some((_, sensor)) = self.plan.schedule.get(self.next).filter(|(at, _)| now >= *at) {
+        while let Some((_, sensor)) = self.plan.schedule.get(self.next).filter(|(at, _)| now >= *at)
+        {
             to = Some(*sensor);
             self.next += 1;
         }
@@ -219,7 +221,12 @@ impl Policy {
         Some((preferred, Reason::Recovered))
     }
 
-    fn scene(&mut self, now: Duration, active: usize, watches: &Watches<'_, '_>) -> Option<(usize, Reason)> {
+    fn scene(
+        &mut self,
+        now: Duration,
+        active: usize,
+        watches: &Watches<'_, '_>,
+    ) -> Option<(usize, Reason)> {
         let plan = self.plan.scene?;
         let watch = watches.get(plan.watch)?;
         let condition = watch.condition(now);

@@ -25,10 +25,8 @@ impl Scene {
     /// ten bits); other formats do not use it.
     pub fn measure(view: &FrameView<'_>, full: u16) -> Self {
         let (data, stride) = (view.data(), view.stride());
-        let limited = matches!(
-            view.format(),
-            PixelFormat::Yuyv | PixelFormat::Uyvy | PixelFormat::Nv12
-        );
+        let limited =
+            matches!(view.format(), PixelFormat::Yuyv | PixelFormat::Uyvy | PixelFormat::Nv12);
         // Where limited-range luma is black and white.
         let (black, white) = match view.format() {
             PixelFormat::Y16 { .. } => (0.0, f32::from(full.max(1))),

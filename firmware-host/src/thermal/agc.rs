@@ -132,6 +132,11 @@ impl Agc {
         });
     }
 
+    /// Time goes by without a picture to follow: what comes after is no later for it.
+    pub fn hold(&mut self, at: Duration) {
+        self.at = at;
+    }
+
     /// At least the minimum span, inside the sensor's range.
     fn widened(&self, low: f32, high: f32) -> (f32, f32) {
         let grow = ((self.min_span - (high - low)) * 0.5).max(0.0);

@@ -66,7 +66,9 @@ impl Thermal {
         frozen: bool,
     ) -> Result<Status, FrameError> {
         let status = self.status(whole);
-        if let (Picture::Raw, false) = (self.layout.picture, frozen || status.shutter) {
+        if frozen || status.shutter {
+            self.agc.hold(at);
+        } else if self.layout.picture == Picture::Raw {
             self.agc.follow(&self.picture(whole)?, at);
         }
         Ok(status)
@@ -99,7 +101,8 @@ impl Thermal {
             low..high.clamp(low + 1, n)
         };
         let (cx, cy) = bbox.centre();
-        let (columns, lines) = (span(cx, bbox.w, kx, data.width()), span(cy, bbox.h, ky, data.height()));
+        let (columns, lines) =
+            (span(cx, bbox.w, kx, data.width()), span(cy, bbox.h, ky, data.height()));
         let (mut sum, mut count, mut max) = (0u64, 0u64, 0u16);
         for y in lines {
             let row = &data.data()[y * data.stride()..][..2 * data.width()];

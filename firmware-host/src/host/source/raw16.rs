@@ -51,7 +51,9 @@ fn check_length(path: &Path, want: usize) -> Result<(), SourceError> {
     }
     Err(SourceError::Decode {
         path: path.to_path_buf(),
-        reason: format!("{length} bytes; raw 16-bit pictures of this size have {want}: check `size`"),
+        reason: format!(
+            "{length} bytes; raw 16-bit pictures of this size have {want}: check `size`"
+        ),
     })
 }
 

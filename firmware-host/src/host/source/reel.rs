@@ -1,9 +1,9 @@
 //! Pictures from files or from memory, played at a rate, with faults on request.
 
 use super::{Captured, Counters, Held, Polled, Source};
-use crate::host::Clock;
 use crate::error::HostError;
 use crate::frames::FrameSource;
+use crate::host::Clock;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::time::Duration;
