@@ -14,6 +14,8 @@ pub const EXIT_CHECK_FAILED: u8 = 1;
 pub const EXIT_BAD_INPUT: u8 = 2;
 /// The input was fine, the work failed or was interrupted.
 pub const EXIT_RUNTIME: u8 = 3;
+/// No sensor delivered a usable picture for as long as the configuration allows (`tsda run`).
+pub const EXIT_NO_PICTURES: u8 = 4;
 
 /// Any failure of a command.
 #[derive(Debug, thiserror::Error)]

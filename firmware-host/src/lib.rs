@@ -10,14 +10,19 @@
 //!    [`bench`]: what a frame costs.
 //! 5. [`replay`]: scripted runs, to check the tracker frame by frame.
 //! 6. [`trax`]: sessions with the VOT toolkit.
-//! 7. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
+//! 7. [`host`]: the program on a board (`tsda run`); [`switch`]: when and how sensors are changed;
+//!    [`thermal`]: thermal cameras; `camera` (feature `camera`): V4L2.
+//! 8. [`cli`]: the commands; [`error`]: one error type with its exit codes; [`output`]: files that
 //!    appear whole or not at all.
 
 pub mod bench;
+#[cfg(feature = "camera")]
+pub mod camera;
 pub mod cli;
 pub mod engine;
 pub mod error;
 pub mod frames;
+pub mod host;
 pub mod metrics;
 pub mod model;
 pub mod output;
@@ -26,6 +31,8 @@ pub mod redetect;
 pub mod render;
 pub mod replay;
 pub mod sequence;
+pub mod switch;
+pub mod thermal;
 pub mod track;
 pub mod trax;
 pub mod video;

@@ -277,6 +277,10 @@ pub fn reference(
             let pair = y * stride + (x / 2) * 4;
             yuv_to_rgb(data[y * stride + 2 * x], data[pair + 1], data[pair + 3])
         }),
+        PixelFormat::Uyvy => resample(window, out, norm, |y, x| {
+            let pair = y * stride + (x / 2) * 4;
+            yuv_to_rgb(data[y * stride + 2 * x + 1], data[pair], data[pair + 2])
+        }),
         PixelFormat::Nv12 => {
             let chroma = frame.height() * stride;
             resample(window, out, norm, |y, x| {

@@ -11,7 +11,8 @@ pub enum PixelFormat {
     /// One byte per pixel; replicated to three channels.
     Gray8,
     /// Two bytes per pixel, little endian, mapped linearly so that `low` becomes 0 and `high` 255
-    /// (values outside are clamped); replicated to three channels.
+    /// (values outside are clamped); replicated to three channels. Sensors of 10, 12 or 14 bits in
+    /// 16-bit words (V4L2 `Y10 `, `Y12 `, `Y14 `) are read with this too.
     Y16 {
         /// Raw value shown as 0.
         low: u16,
@@ -20,6 +21,8 @@ pub enum PixelFormat {
     },
     /// Packed 4:2:2, two pixels in four bytes: Y0 U Y1 V, BT.601 limited range. Even width.
     Yuyv,
+    /// Packed 4:2:2 like [`Self::Yuyv`], in the order U Y0 V Y1.
+    Uyvy,
     /// Planar luma followed by interleaved half-size U, V; BT.601 limited range. Even sides.
     Nv12,
 }
@@ -30,7 +33,7 @@ impl PixelFormat {
         match self {
             Self::Rgb8 | Self::Bgr8 => width * 3,
             Self::Gray8 | Self::Nv12 => width,
-            Self::Y16 { .. } | Self::Yuyv => width * 2,
+            Self::Y16 { .. } | Self::Yuyv | Self::Uyvy => width * 2,
         }
     }
 }
@@ -104,7 +107,9 @@ impl<'a> FrameView<'a> {
         }
         let unsuited = |want| Err(FrameError::Format { width, height, want });
         match format {
-            PixelFormat::Yuyv if width % 2 == 1 => return unsuited("YUYV needs an even width"),
+            PixelFormat::Yuyv | PixelFormat::Uyvy if width % 2 == 1 => {
+                return unsuited("YUYV and UYVY need an even width");
+            }
             PixelFormat::Nv12 if width % 2 == 1 || height % 2 == 1 => {
                 return unsuited("NV12 needs an even width and height");
             }
@@ -117,7 +122,7 @@ impl<'a> FrameView<'a> {
         let row = match format {
             PixelFormat::Rgb8 | PixelFormat::Bgr8 => width.checked_mul(3),
             PixelFormat::Gray8 | PixelFormat::Nv12 => Some(width),
-            PixelFormat::Y16 { .. } | PixelFormat::Yuyv => width.checked_mul(2),
+            PixelFormat::Y16 { .. } | PixelFormat::Yuyv | PixelFormat::Uyvy => width.checked_mul(2),
         }
         .ok_or(overflow)?;
         if stride < row {

@@ -128,6 +128,7 @@ fn hundreds_of_frames_in_every_format_allocate_nothing() {
         (PixelFormat::Gray8, 1),
         (PixelFormat::Y16 { low: 100, high: 60_000 }, 2),
         (PixelFormat::Yuyv, 2),
+        (PixelFormat::Uyvy, 2),
         (PixelFormat::Nv12, 1),
     ];
     for spec in [ModelSpec::NANO, ModelSpec { crop: 96, templates: 4, ..ModelSpec::NANO }] {

@@ -16,10 +16,12 @@ mod info;
 #[cfg(feature = "eval")]
 mod presence;
 mod progress;
+mod register;
 mod render;
 mod replay;
 #[cfg(feature = "eval")]
 mod report;
+mod run;
 #[cfg(feature = "eval")]
 mod score;
 mod track;
@@ -101,6 +103,10 @@ pub enum Command {
     /// Fit the map from score to probability on labelled sequences and store it in a bundle
     #[cfg(feature = "eval")]
     Calibrate(calibrate::CalibrateArgs),
+    /// Run on a board: cameras in, boxes out, as a configuration says
+    Run(run::RunArgs),
+    /// Estimate where a point of one sensor's picture lies in the other's, from pairs of points
+    Register(register::RegisterArgs),
     /// List V4L2 cameras and their formats
     #[cfg(feature = "camera")]
     Devices,
@@ -279,6 +285,8 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Presence(args) => presence::run(args),
         #[cfg(feature = "eval")]
         Command::Calibrate(args) => calibrate::run(args),
+        Command::Run(args) => run::run(args),
+        Command::Register(args) => register::run(args),
         #[cfg(feature = "camera")]
         Command::Devices => devices::run(),
     }

@@ -5,6 +5,7 @@
 //! are.
 
 use crate::error::{EXIT_OK, HostError};
+use crate::host::plan::{RAW_FIRST, RAW_STEP};
 use crate::output::write_file;
 use crate::picture::Picture;
 use crate::render::{Clip, ClipConfig};
@@ -24,6 +25,10 @@ pub struct RenderArgs {
     /// Frames per sequence
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u16).range(2..))]
     pub frames: u16,
+    /// Instead, one scene for cameras that are played: rgb.rgb3, rgb.mjpg, thermal.y16 (0.01 K) and
+    /// truth.txt, frame after frame without headers
+    #[arg(long)]
+    pub raw: bool,
 }
 
 /// Name, seed, and the sensor in the `color` channel of a frame.
@@ -40,6 +45,9 @@ const ANCHORS: usize = 20;
 
 pub(super) fn run(args: &RenderArgs) -> Result<u8, HostError> {
     let frames = usize::from(args.frames);
+    if args.raw {
+        return raw(&Clip::new(ClipConfig { frames, ..ClipConfig::default() }), &args.out);
+    }
     for (name, seed, sensor) in SEQUENCES {
         // Night falls in the middle of the story; shorter sequences show its beginning, not all of it
         // faster.
@@ -49,6 +57,30 @@ pub(super) fn run(args: &RenderArgs) -> Result<u8, HostError> {
     }
     let names: String = SEQUENCES.iter().map(|(name, ..)| format!("{name}\n")).collect();
     write_file(&args.out.join("list.txt"), names.as_bytes())?;
+    Ok(EXIT_OK)
+}
+
+/// What tests/v4l2 plays to the drivers.
+fn raw(clip: &Clip, out: &Path) -> Result<u8, HostError> {
+    create_dir_all(out).map_err(|source| HostError::Create { path: out.to_path_buf(), source })?;
+    let (mut rgb, mut mjpg, mut thermal) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut truth, mut picture) = (String::new(), Picture::default());
+    for frame in 0..clip.frames() {
+        clip.render(frame, Modality::Rgb, &mut picture);
+        rgb.extend_from_slice(&picture.data);
+        let bytes = jpeg(&picture)
+            .map_err(|e| HostError::Encode { path: out.join("rgb.mjpg"), reason: e.to_string() })?;
+        mjpg.extend(bytes);
+        clip.render(frame, Modality::Thermal, &mut picture);
+        let words = picture.data.iter().map(|v| RAW_FIRST + RAW_STEP * u16::from(*v));
+        thermal.extend(words.flat_map(u16::to_le_bytes));
+        let b = clip.truth(frame);
+        truth += &format!("{:.3},{:.3},{:.3},{:.3}\n", b.x, b.y, b.w, b.h);
+    }
+    write_file(&out.join("rgb.rgb3"), &rgb)?;
+    write_file(&out.join("rgb.mjpg"), &mjpg)?;
+    write_file(&out.join("thermal.y16"), &thermal)?;
+    write_file(&out.join("truth.txt"), truth.as_bytes())?;
     Ok(EXIT_OK)
 }
 

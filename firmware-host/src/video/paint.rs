@@ -24,6 +24,10 @@ fn pixel(view: &FrameView<'_>, x: usize, y: usize) -> Colour {
             let pair = row + (x / 2) * 4;
             yuv_to_rgb(data[row + 2 * x], data[pair + 1], data[pair + 3], false)
         }
+        PixelFormat::Uyvy => {
+            let pair = row + (x / 2) * 4;
+            yuv_to_rgb(data[row + 2 * x + 1], data[pair], data[pair + 2], false)
+        }
         PixelFormat::Nv12 => {
             let chroma = (view.height() + y / 2) * view.stride() + (x / 2) * 2;
             yuv_to_rgb(data[row + x], data[chroma], data[chroma + 1], false)

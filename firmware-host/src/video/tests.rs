@@ -30,11 +30,13 @@ fn every_format_shows_the_same_picture() {
     // BT.601 limited range of that red.
     let (y, u, v) = (86u8, 107u8, 202u8);
     let yuyv = [y, u, y, v].repeat(4);
+    let uyvy = [u, y, v, y].repeat(4);
     let nv12 = [vec![y; 8], [u, v].repeat(2)].concat();
     for (data, format) in [
         (red.repeat(8), PixelFormat::Rgb8),
         (bgr, PixelFormat::Bgr8),
         (yuyv, PixelFormat::Yuyv),
+        (uyvy, PixelFormat::Uyvy),
         (nv12, PixelFormat::Nv12),
     ] {
         let view = FrameView::new(&data, w, h, format.row_bytes(w), format).expect("view");

@@ -103,7 +103,9 @@ fn formats_agree_on_a_grey_picture() {
     let stride = 150;
     let mut nv12 = vec![0; stride * (h + h / 2)];
     let mut yuyv = vec![0; stride * h];
+    let mut uyvy = vec![0; stride * h];
     let mut y16 = vec![0; stride * h];
+    let mut y10 = vec![0; stride * h];
     let mut bgr = vec![0; 3 * w * h];
     for y in 0..h {
         for x in 0..w {
@@ -111,6 +113,11 @@ fn formats_agree_on_a_grey_picture() {
             nv12[y * stride + x] = v;
             yuyv[y * stride + 2 * x] = v;
             yuyv[y * stride + 2 * x + 1] = 128;
+            uyvy[y * stride + 2 * x] = 128;
+            uyvy[y * stride + 2 * x + 1] = v;
+            let raw = 200 + 3 * u16::from(v);
+            assert!(raw < 1024, "ten bits");
+            y10[y * stride + 2 * x..][..2].copy_from_slice(&raw.to_le_bytes());
             let raw = 1000 + 20 * u16::from(v);
             y16[y * stride + 2 * x..][..2].copy_from_slice(&raw.to_le_bytes());
             bgr[3 * (y * w + x)..][..3].fill(v);
@@ -121,6 +128,8 @@ fn formats_agree_on_a_grey_picture() {
     let frames = [
         (view(&nv12, stride, PixelFormat::Nv12), true),
         (view(&yuyv, stride, PixelFormat::Yuyv), true),
+        (view(&uyvy, stride, PixelFormat::Uyvy), true),
+        (view(&y10, stride, PixelFormat::Y16 { low: 200, high: 200 + 3 * 255 }), false),
         (view(&y16, stride, PixelFormat::Y16 { low: 1000, high: 1000 + 20 * 255 }), false),
         (view(&bgr, 3 * w, PixelFormat::Bgr8), false),
         (view(&bgr, 3 * w, PixelFormat::Rgb8), false),
@@ -151,12 +160,14 @@ fn colours_are_read_in_the_right_order() {
         let rgb8: Vec<u8> = rgb.iter().copied().cycle().take(4 * 4 * 3).collect();
         let bgr8: Vec<u8> = rgb.iter().rev().copied().cycle().take(4 * 4 * 3).collect();
         let yuyv: Vec<u8> = [yuv[0], yuv[1], yuv[0], yuv[2]].into_iter().cycle().take(32).collect();
+        let uyvy: Vec<u8> = [yuv[1], yuv[0], yuv[2], yuv[0]].into_iter().cycle().take(32).collect();
         let mut nv12 = vec![yuv[0]; 16];
         nv12.extend([yuv[1], yuv[2]].into_iter().cycle().take(8));
         for (data, stride, format) in [
             (&rgb8, 12, PixelFormat::Rgb8),
             (&bgr8, 12, PixelFormat::Bgr8),
             (&yuyv, 8, PixelFormat::Yuyv),
+            (&uyvy, 8, PixelFormat::Uyvy),
             (&nv12, 4, PixelFormat::Nv12),
         ] {
             let frame = FrameView::new(data, 4, 4, stride, format).unwrap();

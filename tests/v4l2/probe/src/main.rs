@@ -1,0 +1,173 @@
+//! What plays cameras in the virtual machine of the V4L2 tests: writes frames into v4l2loopback, plays
+//! USB cameras, sets controls of vivid, says what a device is set to.
+mod raw;
+mod usbcam;
+
+use raw::*;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+type R<T> = Result<T, Box<dyn std::error::Error>>;
+
+fn arg(args: &[String], key: &str) -> Option<String> {
+    args.iter().position(|a| a == key).and_then(|i| args.get(i + 1)).cloned()
+}
+fn num<T: std::str::FromStr>(args: &[String], key: &str, default: T) -> T {
+    arg(args, key).and_then(|v| v.parse().ok()).unwrap_or(default)
+}
+fn size(args: &[String]) -> R<(u32, u32)> {
+    let s = arg(args, "--size").unwrap_or_else(|| "640x480".into());
+    let (w, h) = s.split_once('x').ok_or("--size is WxH")?;
+    Ok((w.parse()?, h.parse()?))
+}
+
+fn main() {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = args.iter().map(String::as_str).collect();
+    let r = match words[..] {
+        ["caps", device, ..] => caps(device),
+        ["set", device, control, value, ..] => Device::open(device)
+            .and_then(|d| d.set_ctrl_by_name(control, value.parse().unwrap_or(0)))
+            .map_err(Into::into),
+        ["feed", device, ..] => feed(device, &args),
+        ["usbcam", model, ..] => usb_cam(model, &args),
+        _ => {
+            eprintln!(
+                "usage: v4l2probe caps DEV | set DEV CONTROL VALUE | feed DEV .. | usbcam MODEL .."
+            );
+            std::process::exit(2)
+        }
+    };
+    if let Err(e) = r {
+        eprintln!("FAIL: {e}");
+        std::process::exit(1);
+    }
+}
+
+fn caps(path: &str) -> R<()> {
+    let f = Device::open(path)?.get_fmt(BUF_CAPTURE)?;
+    println!("current: {}x{} {}", f.width, f.height, fourcc_str(f.pixelformat));
+    Ok(())
+}
+
+/// Frames of a file, in a loop: raw ones of one size, or JPEGs laid end to end for MJPG. With
+/// `--go FILE` the first is repeated until that file is there, so that two feeders start together;
+/// says how many frames that took.
+fn feed(path: &str, args: &[String]) -> R<()> {
+    let (w, h) = size(args)?;
+    let fcc = arg(args, "--fourcc").unwrap_or_else(|| "YUYV".into());
+    let (n, fps): (u32, u32) = (num(args, "-n", 100), num(args, "--fps", 30));
+    let d = Device::open(path)?;
+    let f = d.set_fmt(BUF_OUTPUT, w, h, fourcc(&fcc))?;
+    if f.pixelformat != fourcc(&fcc) || (f.width, f.height) != (w, h) {
+        return Err("the loopback took another format".into());
+    }
+    let file = std::fs::read(arg(args, "--file").ok_or("--file is missing")?)?;
+    let mut frames: Vec<&[u8]> = Vec::new();
+    if fcc == "MJPG" {
+        let mut at = 0;
+        while let Some(len) = file[at..].windows(2).position(|m| m == [0xff, 0xd9]) {
+            frames.push(&file[at..at + len + 2]);
+            at += len + 2;
+        }
+    } else {
+        let bits = match fcc.as_str() {
+            "NV12" => 12,
+            "RGB3" | "BGR3" => 24,
+            "GREY" => 8,
+            _ => 16,
+        };
+        frames.extend(file.chunks_exact(w as usize * h as usize * bits / 8));
+    }
+    let pause = Duration::from_secs_f64(1.0 / f64::from(fps));
+    let mut held = 0;
+    if let Some(go) = arg(args, "--go") {
+        while !Path::new(&go).exists() {
+            d.write_frame(frames[0])?;
+            held += 1;
+            std::thread::sleep(pause);
+        }
+    }
+    println!("held {held}");
+    let t0 = Instant::now();
+    for i in 0..n {
+        d.write_frame(frames[i as usize % frames.len()])?;
+        let due = t0 + pause * (i + 1);
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+    }
+    Ok(())
+}
+
+/// Where the target is in frame `n`: a slow Lissajous path, the same on both sides.
+fn target(n: u32, w: u32, h: u32) -> (f32, f32) {
+    let t = n as f32 * 0.08;
+    ((0.5 + 0.35 * t.sin()) * w as f32, (0.5 + 0.35 * (1.3 * t).cos()) * h as f32)
+}
+const BOX: f32 = 6.0;
+
+fn paint(buf: &mut [u8], fcc: &str, n: u32, w: u32, h: u32) {
+    let (cx, cy) = target(n, w, h);
+    for y in 0..h {
+        for x in 0..w {
+            let hot = (x as f32 - cx).abs() <= BOX && (y as f32 - cy).abs() <= BOX;
+            let i = ((y * w + x) * 2) as usize;
+            if fcc == "YUYV" {
+                buf[i] = if hot { 235 } else { 40 + ((x * 3 + y * 5) % 60) as u8 };
+                buf[i + 1] = 128;
+            } else {
+                // radiometric counts: 0.01 K, background about 20 C, target 37 C
+                let v: u16 = if hot { 31015 } else { 29315 + ((x * 3 + y * 5) % 200) as u16 };
+                buf[i..i + 2].copy_from_slice(&v.to_le_bytes());
+            }
+        }
+    }
+    // frame stamp in the first two pixels and in the last two: a torn frame shows
+    let end = (w * h * 2) as usize;
+    buf[..4].copy_from_slice(&n.to_le_bytes());
+    buf[end - 4..end].copy_from_slice(&n.to_le_bytes());
+}
+
+/// Plays a USB camera: `usbcam MODEL [--fps N] [--frames N] [--unplug-at N --replug-ms N] ...`
+fn usb_cam(model: &str, args: &[String]) -> R<()> {
+    let m = usbcam::MODELS.iter().find(|m| m.name == model).ok_or("no such model")?;
+    let plan = usbcam::Plan {
+        short_every: num(args, "--short-every", 0),
+        error_every: num(args, "--error-every", 0),
+        stall_at: num(args, "--stall-at", 0),
+        stall_ms: num(args, "--stall-ms", 3000),
+        unplug_at: num(args, "--unplug-at", 0),
+    };
+    let mut left: u32 = num(args, "--plugs", if plan.unplug_at > 0 { 2 } else { 1 });
+    while left > 0 {
+        left -= 1;
+        let c = usbcam::plug(m, num(args, "--fps", 9))?;
+        let mut p = plan.clone();
+        if left == 0 {
+            p.unplug_at = 0;
+        }
+        let n = c.run(num(args, "--frames", 100_000), &p, |b, n, w, h| {
+            let (w, h) = (w as u32, h as u32);
+            match (model, w, h) {
+                // two telemetry rows under the picture
+                ("purethermal", 160, 122) => paint(&mut b[..38400], "Y16 ", n, w, 120),
+                ("boson", _, 514) => paint(&mut b[..640 * 512 * 2], "Y16 ", n, w, 512),
+                // picture above, temperatures below
+                ("p2pro", _, 384) => {
+                    let (top, low) = b.split_at_mut(256 * 192 * 2);
+                    paint(top, "YUYV", n, w, 192);
+                    paint(low, "Y16 ", n, w, 192);
+                    for c in low.chunks_exact_mut(2).skip(2) {
+                        let k = u16::from_le_bytes([c[0], c[1]]) as u32 * 64 / 100; // 0.01 K to 1/64 K
+                        c.copy_from_slice(&(k as u16).to_le_bytes());
+                    }
+                }
+                ("p2pro", ..) => paint(b, "YUYV", n, w, h),
+                _ if b.len() == (w * h * 2) as usize => paint(b, "Y16 ", n, w, h),
+                _ => b.fill(n as u8),
+            }
+        })?;
+        println!("usbcam: {n} frames sent, plug pulled");
+        std::thread::sleep(Duration::from_millis(num(args, "--replug-ms", 1500)));
+    }
+    Ok(())
+}

@@ -1,0 +1,69 @@
+#!/bin/bash
+# `tsda run` on real V4L2 drivers without hardware: user-mode Linux (or QEMU) with vivid,
+# v4l2loopback, and a USB thermal camera played to the real uvcvideo.
+#
+#   tests/v4l2/run.sh [--qemu] [--require] [TEST...]      TESTs: vivid faults loopback uvc
+#
+# Without --require it says why and ends with 0 where it cannot run (not root, no packages).
+# TSDA and PROBE may name programs that are already built; TSDA needs the feature `camera`.
+# QEMU_V4L2_CACHE is where kernels are kept (vm.sh --help).
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+root=$(cd "$here/../.." && pwd)
+back=--uml require= tests=()
+for a; do
+  case $a in
+    --qemu) back= ;;
+    --require) require=y ;;
+    -*) sed -n '2,/^set -/{/^set -/d;s/^# \{0,1\}//p}' "$0"; exit 2 ;;
+    *) tests+=("$a") ;;
+  esac
+done
+[ ${#tests[@]} -gt 0 ] || tests=(vivid faults loopback uvc)
+
+skip() {
+  [ -z "$require" ] || { echo "cannot run: $1" >&2; exit 1; }
+  echo "skipped: V4L2 tests: $1"
+  exit 0
+}
+[ "$(uname -s)-$(uname -m)" = Linux-x86_64 ] || skip "the virtual machine is for x86-64 Linux"
+command -v apt-get >/dev/null || skip "kernels come from Debian packages, and there is no apt-get"
+[ "$(id -u)" = 0 ] || [ -e "${QEMU_V4L2_CACHE:-$HOME/.cache/qemu-v4l2-test}/uml/.done" ] ||
+  skip "needs root to install what builds the kernel"
+log=$(mktemp -d)
+trap 'rm -rf "$log"' EXIT
+"$here/vm.sh" $back --vivid --loopback=2 --uvc --prepare >"$log/prepare" 2>&1 ||
+  skip "no kernel: $(tail -1 "$log/prepare")"
+
+if [ -z "${TSDA:-}" ]; then
+  (cd "$root" && cargo build --workspace --bin tsda --features tsda-host/camera) ||
+    { echo "tsda does not build with cameras" >&2; exit 1; }
+  TSDA=${CARGO_TARGET_DIR:-$root/target}/debug/tsda
+fi
+if [ -z "${PROBE:-}" ]; then
+  (cd "$here/probe" && CARGO_TARGET_DIR=$log/probe cargo build --quiet) ||
+    { echo "the camera player does not build" >&2; exit 1; }
+  PROBE=$log/probe/debug/v4l2probe
+fi
+"$TSDA" render --out "$log/clip" --raw --frames 96
+
+failed=()
+for t in "${tests[@]}"; do
+  case $t in
+    vivid | faults) devices=(--vivid) ;;
+    loopback) devices=(--loopback=2) ;;
+    uvc) devices=(--uvc) ;;
+    *) echo "no test $t" >&2; exit 2 ;;
+  esac
+  echo "== $t"
+  if "$here/vm.sh" $back "${devices[@]}" --timeout "${LIMIT:-240}" --mem 768 --out "$log/out-$t" \
+    --add "$PROBE:/bin/probe" --add "$log/clip:/data/clip" --add "$here/lib.sh:/data/lib.sh" \
+    --sh "$here/t-$t.sh" "$TSDA"; then
+    echo "== $t: ok"
+  else
+    echo "== $t: FAILED ($?)"
+    failed+=("$t")
+    tail -5 "$log/out-$t"/*.err 2>/dev/null || true
+  fi
+done
+[ ${#failed[@]} -eq 0 ] || { echo "failed: ${failed[*]}"; exit 1; }
