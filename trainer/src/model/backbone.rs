@@ -85,6 +85,7 @@ impl FreezePolicy {
 /// One of the feature extractors of [`Backbone`].
 #[derive(Module, Debug)]
 #[allow(clippy::large_enum_variant)] // One per program.
+#[allow(clippy::enum_variant_names)] // What the networks are called.
 pub(crate) enum BackboneNet {
     /// See [`EfficientNetLite0`].
     EfficientNet(EfficientNetLite0),
