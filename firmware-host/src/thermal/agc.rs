@@ -7,6 +7,7 @@
 
 use super::profile::{Layout, ThermalError};
 use serde::{Deserialize, Serialize};
+use std::cmp::Ordering;
 use std::time::Duration;
 use tsda_runtime::FrameView;
 
@@ -90,7 +91,8 @@ impl Agc {
                     None => v.clamp(0.0, 65535.0) as f32,
                 };
                 let (low, high) = (raw(w.low), raw(w.high));
-                if !(low + 1.0 <= high) {
+                if !matches!((low + 1.0).partial_cmp(&high), Some(Ordering::Less | Ordering::Equal))
+                {
                     return refuse(
                         "agc.window",
                         format!("low {} and high {} leave no range between them", w.low, w.high),
