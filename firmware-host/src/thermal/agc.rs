@@ -90,7 +90,7 @@ impl Agc {
                     None => v.clamp(0.0, 65535.0) as f32,
                 };
                 let (low, high) = (raw(w.low), raw(w.high));
-                if !(low + 1.0 <= high) {
+                if low.is_nan() || high.is_nan() || low + 1.0 > high {
                     return refuse(
                         "agc.window",
                         format!("low {} and high {} leave no range between them", w.low, w.high),
