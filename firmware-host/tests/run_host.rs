@@ -265,9 +265,9 @@ fn a_signal_ends_the_run_cleanly() {
         std::thread::sleep(std::time::Duration::from_millis(20));
     };
     let mut lines = BufReader::new(stream).lines();
-    let first: Value =
-        serde_json::from_str(&lines.next().expect("line").expect("read")).expect("json");
-    assert_eq!(first["type"], "frame");
+    // Whoever connects early sees the first events, whoever connects late does not.
+    let frame = lines.by_ref().take(50).any(|l| l.expect("read").contains("\"type\":\"frame\""));
+    assert!(frame, "frames arrive");
     let killed = Command::new("kill").arg(child.id().to_string()).status().expect("kill");
     assert!(killed.success());
     assert_eq!(child.wait().expect("ends").code(), Some(0));

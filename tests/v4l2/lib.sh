@@ -5,12 +5,14 @@ ok() { echo "ok: $*"; }
 
 # config NAME DEVICE FORMAT WxH [more keys of v4l2]: a configuration with one camera
 config() {
+  profile=
+  [ -z "${PROFILE:-}" ] || profile="profile = \"$PROFILE\""
   cat >/tmp/$1.toml <<C
 give_up_s = 8
 [[source]]
 name = "cam"
 sensor = "${SENSOR:-rgb}"
-${PROFILE:+profile = "$PROFILE"}
+$profile
 v4l2 = { device = "$2", format = "$3", size = [${4%x*}, ${4#*x}]${5:+, $5} }
 [target]
 box = [${BOX:-40, 30, 40, 40}]
