@@ -39,4 +39,4 @@ pub use memory::TemplateMemory;
 #[cfg(feature = "std")]
 pub use one_line::one_line;
 pub use spec::{Backbone, ModelSpec, SpecError, TrackerParams};
-pub use tracker::{BoxError, RedetectOptions, Track, TrackError, TrackState, Tracker};
+pub use tracker::{BoxError, MotionPrior, RedetectOptions, Track, TrackError, TrackState, Tracker};

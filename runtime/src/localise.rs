@@ -75,14 +75,34 @@ pub fn localise(
     target: Yx,
     previous: Yx,
 ) -> Located {
-    let first = peak(scores, side, |_, _| false);
-    if first.score < params.not_found {
-        return Located { flag: Flag::NotFound, cell: first.cell, first, second: None };
+    localise_weighted(scores, side, params, target, previous, |_, _| 1.0)
+}
+
+/// [`localise`] on scores that are multiplied by `weight(row, column)` before they are compared with
+/// one another. Whether the target is there at all is asked of the score itself, and that is what
+/// peaks report.
+pub(crate) fn localise_weighted(
+    scores: &[f32],
+    side: usize,
+    params: &TrackerParams,
+    target: Yx,
+    previous: Yx,
+    weight: impl Fn(usize, usize) -> f32,
+) -> Located {
+    let plain = |p: Peak| {
+        let score = scores.get(p.cell.row * side + p.cell.col).copied().unwrap_or(p.score);
+        Peak { score, ..p }
+    };
+    let first = peak(scores, side, |row, col| Some(weight(row, col)));
+    if plain(first).score < params.not_found {
+        return Located { flag: Flag::NotFound, cell: first.cell, first: plain(first), second: None };
     }
     let rows = block(first.cell.row, params.neighbourhood * target.y, side);
     let cols = block(first.cell.col, params.neighbourhood * target.x, side);
     // Masked cells count as 0, not as minus infinity (quirk Q9).
-    let second = peak(scores, side, |r, c| rows.contains(&r) && cols.contains(&c));
+    let second = peak(scores, side, |row, col| {
+        (!(rows.contains(&row) && cols.contains(&col))).then(|| weight(row, col))
+    });
 
     let middle = (side as f32 - 1.0) * 0.5;
     let moved = |p: &Peak| {
@@ -104,7 +124,7 @@ pub fn localise(
     } else {
         (Flag::Normal, first.cell)
     };
-    Located { flag, cell, first, second: Some(second) }
+    Located { flag, cell, first: plain(first), second: Some(second) }
 }
 
 /// Rows or columns of the block around a peak that the second peak may not come from.
@@ -114,16 +134,17 @@ fn block(centre: usize, length: f32, side: usize) -> core::ops::Range<usize> {
     edge(centre - length * 0.5)..edge(centre + length * 0.5 + 1.0)
 }
 
-/// The maximum; of equal ones that with the smaller column, then the smaller row (quirk Q9). Cells
-/// for which `masked(row, column)` holds count as 0.
-fn peak(scores: &[f32], side: usize, masked: impl Fn(usize, usize) -> bool) -> Peak {
+/// The maximum; of equal ones that with the smaller column, then the smaller row (quirk Q9). Scores
+/// count times `weight(row, column)`, cells without a weight as 0.
+fn peak(scores: &[f32], side: usize, weight: impl Fn(usize, usize) -> Option<f32>) -> Peak {
     let mut best = Peak { cell: Cell::default(), score: f32::NEG_INFINITY };
     for col in 0..side {
         for row in 0..side {
-            let score = if masked(row, col) {
-                0.0
-            } else {
-                scores.get(row * side + col).copied().unwrap_or(f32::NEG_INFINITY)
+            let score = match weight(row, col) {
+                Some(weight) => {
+                    scores.get(row * side + col).map_or(f32::NEG_INFINITY, |score| score * weight)
+                }
+                None => 0.0,
             };
             if score > best.score {
                 best = Peak { cell: Cell { row, col }, score };

@@ -1,10 +1,12 @@
 //! The online tracker (spec 3): one target, one frame at a time, no allocation.
 
 mod error;
+mod motion;
 mod redetect;
 mod state;
 
 pub use error::{BoxError, TrackError, check_box};
+pub use motion::MotionPrior;
 pub use redetect::RedetectOptions;
 pub use state::{Search, Target, TrackState};
 
@@ -14,7 +16,7 @@ use crate::engine::{Engine, EngineError};
 use crate::frame::FrameView;
 use crate::geometry::{BBox, Modality, Yx};
 use crate::labels;
-use crate::localise::{Cell, Flag, localise};
+use crate::localise::{Cell, Flag, localise_weighted};
 use crate::memory::{Template, TemplateMemory};
 use crate::spec::{MAX_TEMPLATES, ModelSpec, SpecError, TrackerParams};
 use redetect::Scan;
@@ -56,6 +58,7 @@ pub struct Tracker<E> {
     search: Option<Search>,
     calibration: Option<ScoreCalibration>,
     scan: Option<Scan>,
+    motion: Option<MotionPrior>,
 }
 
 impl<E: Engine> Tracker<E> {
@@ -83,6 +86,7 @@ impl<E: Engine> Tracker<E> {
             search: None,
             calibration: None,
             scan: None,
+            motion: None,
         })
     }
 
@@ -135,7 +139,7 @@ impl<E: Engine> Tracker<E> {
         let Some(mut target) = self.target else {
             return Err(TrackError::NoTarget);
         };
-        let (mut search, mut score) = self.look(frame, &target)?;
+        let (mut search, mut score) = self.look(frame, &target, self.motion)?;
         let mut scan = self.scan;
         let mut redetected = false;
         if let Some(scan) = &mut scan {
@@ -211,7 +215,7 @@ impl<E: Engine> Tracker<E> {
         let size = target.scale() * f32::from(self.spec.crop);
         let mut best: Option<(Search, f32)> = None;
         for centre in scan.positions((frame.height(), frame.width()), size) {
-            let (search, score) = self.look(frame, &target.moved_to(centre))?;
+            let (search, score) = self.look(frame, &target.moved_to(centre), None)?;
             let higher = best.as_ref().is_none_or(|(_, other)| score > *other);
             if search.located.flag != Flag::NotFound && score > threshold && higher {
                 best = Some((search, score));
@@ -225,6 +229,7 @@ impl<E: Engine> Tracker<E> {
         &mut self,
         frame: &FrameView<'_>,
         target: &Target,
+        motion: Option<MotionPrior>,
     ) -> Result<(Search, f32), TrackError> {
         let (spec, params) = (self.spec, self.params);
         let (side, cells) = (f32::from(spec.crop), spec.cells());
@@ -252,14 +257,18 @@ impl<E: Engine> Tracker<E> {
         let patch = window.patch();
         let (sample_pos, sample_scale) = (patch.sample_pos(), patch.sample_scale(side));
         let cell_size = sample_scale * ModelSpec::STRIDE as f32;
-        let located = localise(
+        let previous =
+            Yx::new((pos.y - sample_pos.y) / cell_size, (pos.x - sample_pos.x) / cell_size);
+        let motion = motion.unwrap_or(MotionPrior { window: 0.0, size_rate: 1.0 });
+        let located = localise_weighted(
             maps.scores,
             spec.map_side(),
             &params,
             Yx::new(target.size().y / cell_size, target.size().x / cell_size),
-            Yx::new((pos.y - sample_pos.y) / cell_size, (pos.x - sample_pos.x) / cell_size),
+            previous,
+            motion.weight(target, spec.map_side(), previous),
         );
-        let raw = cell_box(maps.ltrb, located.cell, &patch, &spec);
+        let raw = motion.damp(target, &cell_box(maps.ltrb, located.cell, &patch, &spec));
         let clipped = clip(&raw, frame, params.min_size);
         if !clipped.is_valid() {
             return Err(TrackError::NotFinite { engine: name, what: "ltrb map" });
@@ -352,6 +361,24 @@ impl<E> Tracker<E> {
     /// How the frame is scanned for a lost target, when it is.
     pub fn redetection(&self) -> Option<RedetectOptions> {
         self.scan.map(|s| s.options())
+    }
+
+    /// Has the place and size of the last frame count in the next one; `None`, the default, is the
+    /// reference's way.
+    ///
+    /// # Errors
+    /// When the prior is out of range; the old one then stays.
+    pub fn set_motion_prior(&mut self, motion: Option<MotionPrior>) -> Result<(), SpecError> {
+        if let Some(m) = &motion {
+            m.validate()?;
+        }
+        self.motion = motion;
+        Ok(())
+    }
+
+    /// What the last frame says about the next one, if anything.
+    pub const fn motion_prior(&self) -> Option<MotionPrior> {
+        self.motion
     }
 
     /// The network's shape.
