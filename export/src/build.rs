@@ -143,17 +143,18 @@ impl Plan {
         if let Some(stored) = stored {
             import::check_hidden(stored, &spec, &path.display().to_string())?;
         }
-        // Every data source the trainer reads is a registered RGB-thermal one.
-        let both = !experiment.data.is_empty();
+        // The trainer refuses to draw across sensors when no source has both.
+        let cross_modal = experiment.sampler.cross_modal_p > 0.0;
+        let sensors = || experiment.data.iter().map(|source| source.sensors());
         Ok(Self {
             spec,
             tracker: experiment.tracker,
             config: experiment.to_toml()?,
             trainer: concat!("tsda-train ", env!("CARGO_PKG_VERSION")).into(),
             trained_on: TrainedOn {
-                rgb: both,
-                thermal: both,
-                cross_modal: experiment.sampler.cross_modal_p > 0.0,
+                rgb: cross_modal || sensors().any(|(rgb, _)| rgb),
+                thermal: cross_modal || sensors().any(|(_, thermal)| thermal),
+                cross_modal,
             },
             seed: experiment.run.seed,
             steps: experiment.total_steps(),

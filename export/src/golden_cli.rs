@@ -83,7 +83,7 @@ fn engines(names: &[String]) -> anyhow::Result<Vec<EngineKind>> {
 /// Compares, prints, answers the exit code.
 pub(crate) fn run(args: &GoldenArgs) -> anyhow::Result<ExitCode> {
     let Some(mut spec) = ModelSpec::preset(&args.preset) else {
-        bail!("--preset {}: expected tomp101, tomp50, nano or small", args.preset);
+        bail!("--preset {}: expected tomp101, tomp50, nano, pico, pico-v3 or small", args.preset);
     };
     let engines = engines(&args.engine)?;
     let found = match &args.dir {

@@ -101,7 +101,7 @@ enum Command {
 struct Counted {
     /// The bundle.
     bundle: Option<PathBuf>,
-    /// A preset instead of a bundle: nano, tomp50, tomp101.
+    /// A preset instead of a bundle: nano, pico, pico-v3, tomp50, tomp101.
     #[arg(long)]
     preset: Option<String>,
 }
@@ -220,8 +220,9 @@ fn count(of: &Counted) -> anyhow::Result<MacsReport> {
         return macs::of_bundle(&file.bundle()?).with_context(|| format!("{}", path.display()));
     }
     let name = of.preset.as_deref().unwrap_or_default();
-    let spec = ModelSpec::preset(name)
-        .with_context(|| format!("preset `{name}` is not known; nano, tomp50 and tomp101 are"))?;
+    let spec = ModelSpec::preset(name).with_context(|| {
+        format!("preset `{name}` is not known; nano, pico, pico-v3, tomp50 and tomp101 are")
+    })?;
     // Weights do not matter: shapes are all that is counted.
     Ok(macs::of_graphs(&network::graphs(&network::untrained(&spec, 0)?)?))
 }

@@ -20,6 +20,15 @@ pub enum Backbone {
         /// Bottleneck blocks in stages one to three.
         blocks: [u8; 3],
     },
+    /// The backbone of NanoTrack v2: MobileNetV3-small up to its last stride-16 block (48 channels
+    /// out). Squeeze-excite, ReLU and hard-swish, batch-norm eps 1e-5, symmetric padding. Wants
+    /// [`RAW_MEAN`] and [`RAW_STD`].
+    // New variants go to the end: bundles hold the index.
+    #[serde(rename = "nanotrack_v2")]
+    NanoTrackV2,
+    /// The backbone of NanoTrack v3: one block more than v2, at stride 16 too (96 channels out).
+    #[serde(rename = "nanotrack_v3")]
+    NanoTrackV3,
 }
 
 impl Backbone {
@@ -28,6 +37,30 @@ impl Backbone {
         match self {
             Self::EfficientNetLite0 => 112,
             Self::ResNet { base_channels, .. } => *base_channels as usize * 16,
+            Self::NanoTrackV2 => 48,
+            Self::NanoTrackV3 => 96,
+        }
+    }
+
+    /// Mean and divisor of the pictures its published weights were trained on, as
+    /// [`ModelSpec::input_mean`] and [`ModelSpec::input_std`].
+    pub const fn input_statistics(&self) -> ([f32; 3], [f32; 3]) {
+        match self {
+            Self::EfficientNetLite0 | Self::ResNet { .. } => (IMAGENET_MEAN, IMAGENET_STD),
+            Self::NanoTrackV2 | Self::NanoTrackV3 => (RAW_MEAN, RAW_STD),
+        }
+    }
+}
+
+impl core::fmt::Display for Backbone {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self {
+            Self::EfficientNetLite0 => f.write_str("EfficientNet-Lite0 to stride 16"),
+            Self::ResNet { base_channels, blocks } => {
+                write!(f, "ResNet, {base_channels} channels, blocks {blocks:?}")
+            }
+            Self::NanoTrackV2 => f.write_str("MobileNetV3 of NanoTrack v2, 48 channels"),
+            Self::NanoTrackV3 => f.write_str("MobileNetV3 of NanoTrack v3, 96 channels"),
         }
     }
 }
@@ -76,6 +109,11 @@ pub const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 /// See [`IMAGENET_MEAN`].
 pub const IMAGENET_STD: [f32; 3] = [0.229, 0.224, 0.225];
 
+/// With [`RAW_STD`]: values 0 to 255 as they are, as NanoTrack's backbones want them.
+pub const RAW_MEAN: [f32; 3] = [0.0; 3];
+/// See [`RAW_MEAN`].
+pub const RAW_STD: [f32; 3] = [1.0 / 255.0; 3];
+
 impl ModelSpec {
     /// Pixels of the crop per cell of the map; the same for the whole family.
     pub const STRIDE: usize = 16;
@@ -98,6 +136,20 @@ impl ModelSpec {
         input_mean: IMAGENET_MEAN,
         input_std: IMAGENET_STD,
     };
+
+    /// [`Self::NANO`] on the backbone of NanoTrack v2: the least work.
+    pub const PICO: Self = Self {
+        backbone: Backbone::NanoTrackV2,
+        input_mean: RAW_MEAN,
+        input_std: RAW_STD,
+        ..Self::NANO
+    };
+
+    /// [`Self::NANO`] on the backbone of NanoTrack v3.
+    pub const PICO_V3: Self = Self { backbone: Backbone::NanoTrackV3, ..Self::PICO };
+
+    /// Names that [`Self::preset`] knows.
+    pub const PRESETS: [&str; 6] = ["nano", "pico", "pico-v3", "tomp50", "tomp101", "small"];
 
     /// ToMP-101, the paper's tracker (spec 1).
     pub const TOMP101: Self = Self {
@@ -138,6 +190,8 @@ impl ModelSpec {
     pub fn preset(name: &str) -> Option<Self> {
         match name {
             "nano" => Some(Self::NANO),
+            "pico" => Some(Self::PICO),
+            "pico-v3" => Some(Self::PICO_V3),
             "tomp50" => Some(Self::TOMP50),
             "tomp101" => Some(Self::TOMP101),
             "small" => Some(Self::SMALL),
@@ -317,7 +371,7 @@ mod tests {
 
     #[test]
     fn presets_are_valid_and_named() {
-        for name in ["nano", "tomp50", "tomp101", "small"] {
+        for name in ModelSpec::PRESETS {
             ModelSpec::preset(name).unwrap().validate().unwrap();
         }
         assert!(ModelSpec::preset("tomp").is_none());

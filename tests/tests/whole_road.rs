@@ -1,12 +1,14 @@
 //! The whole road on generated pictures: pairs folder, training, bundle, check, evaluation.
 
-use std::path::Path;
+use prost::Message as _;
+use std::path::{Path, PathBuf};
 use tsda_eval::dataset;
 use tsda_eval::metrics::Scores;
 use tsda_eval::protocol::{Protocol, TrackerError, TrackerUnderTest};
 use tsda_eval::{Options, RuntimeTracker, evaluate};
 use tsda_export::build::{BuildOptions, build};
 use tsda_export::check::check;
+use tsda_export::onnx::proto::ModelProto;
 use tsda_host::picture::Picture;
 use tsda_host::render::{Clip, ClipConfig};
 use tsda_runtime::bundle::BundleFile;
@@ -77,6 +79,69 @@ fn write_pairs(dir: &Path) {
     std::fs::write(dir.join("index.json"), index.to_string()).unwrap();
 }
 
+/// Bundles the final weights of a run.
+fn bundle_of(weights: PathBuf, run: &Path, out: &Path) {
+    build(&BuildOptions {
+        weights,
+        config: Some(run.join("config.resolved.toml")),
+        preset: None,
+        out: out.to_owned(),
+        name: None,
+        card: None,
+        figures: None,
+        data_sources: None,
+        licence: "none".into(),
+        trained_on: Default::default(),
+    })
+    .unwrap();
+}
+
+/// Sections of a bundle, and of every graph its inputs, outputs, nodes and weights by name and
+/// shape.
+fn inventory(bundle: &Path) -> Vec<String> {
+    let file = BundleFile::open(bundle).unwrap();
+    let bundle = file.bundle().unwrap();
+    let mut all = Vec::new();
+    for (kind, bytes) in bundle.sections() {
+        all.push(format!("{kind}: {} bytes", bytes.len()));
+        let Some(graph) = ModelProto::decode(bytes).ok().and_then(|m| m.graph) else { continue };
+        let values =
+            graph.input.iter().chain(&graph.output).map(|v| format!("{kind} {:?}", v.name));
+        all.extend(values);
+        all.extend(graph.node.iter().map(|n| format!("{kind} {:?} {:?}", n.op_type, n.output)));
+        let weights = graph.initializer.iter();
+        all.extend(weights.map(|w| format!("{kind} weight {:?} {:?}", w.name, w.dims)));
+    }
+    all
+}
+
+#[test]
+fn alignment_never_reaches_a_bundle() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    write_pairs(&at("pairs"));
+    let text = CONFIG.replace("validate_every = 3", "validate_every = 0");
+    let mut found = Vec::new();
+    for row in ["cm", "joint"] {
+        let config = at(&format!("{row}.toml"));
+        let align = format!("\n[align]\npreset = \"{row}\"\nstart_step = 1\n");
+        std::fs::write(&config, text.replace("OUT", at(row).to_str().unwrap()) + &align).unwrap();
+        let experiment = Experiment::load(&config).unwrap();
+        let Outcome::Finished { model, .. } = fit(&experiment, &FitOptions::default()).unwrap()
+        else {
+            panic!("{row} did not finish")
+        };
+        let log = std::fs::read_to_string(at(row).join("log.jsonl")).unwrap();
+        assert_eq!(log.contains("discriminator_accuracy"), row == "joint");
+        assert_eq!(at(row).join("checkpoint-000003/align.bpk").exists(), row == "joint");
+        let out = at(&format!("{row}.tsda"));
+        bundle_of(model, &at(row), &out);
+        found.push(inventory(&out));
+    }
+    assert!(found[0].iter().filter(|line| line.contains(" weight ")).count() > 100);
+    assert_eq!(found[0], found[1]);
+}
+
 #[test]
 fn pairs_are_trained_on_exported_and_tracked() {
     let dir = tempfile::tempdir().unwrap();
@@ -91,19 +156,7 @@ fn pairs_are_trained_on_exported_and_tracked() {
     assert!(validation.unwrap().all.cls.is_finite());
 
     let out = at("road.tsda");
-    build(&BuildOptions {
-        weights: model,
-        config: Some(at("out/config.resolved.toml")),
-        preset: None,
-        out: out.clone(),
-        name: None,
-        card: None,
-        figures: None,
-        data_sources: None,
-        licence: "none".into(),
-        trained_on: Default::default(),
-    })
-    .unwrap();
+    bundle_of(model, &at("out"), &out);
     let file = BundleFile::open(&out).unwrap();
     let bundle = file.bundle().unwrap();
     assert_eq!(bundle.manifest().provenance.steps, 3);

@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use tsda_trainer::align_report::{self, AlignOptions, WeightsFrom};
-use tsda_trainer::config::Experiment;
+use tsda_trainer::config::{AlignPreset, Experiment};
 use tsda_trainer::fit::{self, FitOptions, Outcome};
 use tsda_trainer::import::{self, ImportKind, ImportOptions};
 use tsda_trainer::processing::contact_sheet;
@@ -38,9 +38,13 @@ struct Source {
     /// The experiment (TOML).
     #[arg(long)]
     config: PathBuf,
-    /// Folder to take instead of the configuration's only data source.
-    #[arg(long)]
-    data: Option<PathBuf>,
+    /// Folder of a data source instead of the configuration's, as NAME=DIR (NAME: the entry's
+    /// `name`, else its `kind`); just DIR where the configuration has a single source. Repeatable.
+    #[arg(long, value_name = "[NAME=]DIR")]
+    data: Vec<String>,
+    /// Folder that relative paths of the configuration's data sources and weights start from.
+    #[arg(long, value_name = "DIR")]
+    data_root: Option<PathBuf>,
 }
 
 #[derive(clap::Args)]
@@ -62,6 +66,16 @@ struct FitArgs {
     /// Backbone weights, or "scratch", instead of the configuration's.
     #[arg(long)]
     backbone: Option<String>,
+    /// Seed instead of the configuration's.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Row of the ablation instead of what [align] says: none, baseline, cm, pre-afa, pre-cfa,
+    /// enc-afa, enc-cfa or joint. See docs/alignment.md.
+    #[arg(long)]
+    align_preset: Option<AlignPreset>,
+    /// First step with alignment losses instead of the configuration's.
+    #[arg(long)]
+    align_start: Option<u64>,
     /// Where to compute.
     #[arg(long, value_enum, default_value_t = DeviceName::Flex)]
     device: DeviceName,
@@ -77,8 +91,9 @@ enum DeviceName {
 
 #[derive(clap::Args)]
 struct ImportArgs {
-    /// What the input holds: "pytracking" (a ToMP checkpoint), "torchvision-resnet" or
-    /// "efficientnet-lite0" (backbones), "full" (a whole network). Found out when not given.
+    /// What the input holds: "pytracking" (a ToMP checkpoint), "torchvision-resnet",
+    /// "efficientnet-lite0" or "nanotrack" (backbones), "full" (a whole network). Found out when not
+    /// given.
     #[arg(long)]
     kind: Option<ImportKind>,
     /// File to read: PyTorch (zip or legacy) or safetensors.
@@ -87,7 +102,7 @@ struct ImportArgs {
     /// File to write: safetensors that say which network they are of.
     #[arg(long)]
     out: PathBuf,
-    /// The network the weights have to be of: "tomp101", "tomp50" or "nano". Found out when not
+    /// The network the weights have to be of: "tomp101", "tomp50", "nano", ... Found out when not
     /// given; filter size and test-frame embedding always are the file's.
     #[arg(long, conflicts_with = "config")]
     preset: Option<String>,
@@ -144,6 +159,7 @@ struct AlignArgs {
 }
 
 fn main() -> ExitCode {
+    tsda_trainer::memory::keep_freed_memory();
     let result = match Cli::parse().command {
         Command::Fit(args) => run_fit(&args),
         Command::WeightsImport(args) => run_import(&args),
@@ -160,16 +176,30 @@ fn main() -> ExitCode {
 }
 
 fn load(source: &Source) -> Result<Experiment> {
-    let mut experiment = Experiment::load(&source.config)?;
-    if let Some(path) = &source.data {
-        let [only] = experiment.data.as_mut_slice() else {
-            bail!(
-                "--data: {} names {} data sources; it can replace only a single one",
-                source.config.display(),
-                experiment.data.len()
-            );
+    let mut experiment = Experiment::load_from(&source.config, source.data_root.as_deref())?;
+    let config = source.config.display();
+    for text in &source.data {
+        let labels: Vec<String> = experiment.data.iter().map(|s| s.label().to_owned()).collect();
+        let named = text.split_once('=').and_then(|(name, dir)| {
+            let same: Vec<_> = (0..labels.len()).filter(|&i| labels[i] == name).collect();
+            (!same.is_empty()).then_some((same, dir))
+        });
+        let (entry, dir) = match named {
+            Some((same, dir)) if same.len() == 1 => (same[0], dir),
+            Some((same, _)) => bail!(
+                "--data {text}: {} sources of {config} are called so; give them different names \
+                 (key `name`)",
+                same.len()
+            ),
+            None if labels.len() == 1 => (0, text.as_str()),
+            None => bail!(
+                "--data {text}: {config} has {} data sources; say which one: NAME=DIR, NAME one \
+                 of {}",
+                labels.len(),
+                labels.join(", ")
+            ),
         };
-        only.path = path.clone();
+        experiment.data[entry].path = PathBuf::from(dir);
     }
     Ok(experiment)
 }
@@ -194,6 +224,15 @@ fn run_fit(args: &FitArgs) -> Result<()> {
     }
     if let Some(backbone) = &args.backbone {
         experiment.init.backbone = backbone.clone();
+    }
+    if let Some(seed) = args.seed {
+        experiment.run.seed = seed;
+    }
+    if let Some(preset) = args.align_preset {
+        experiment.align.select(preset);
+    }
+    if let Some(step) = args.align_start {
+        experiment.align.start_step = Some(step);
     }
     experiment.validate().context("command line")?;
     let options = FitOptions {
@@ -262,6 +301,15 @@ fn run_sheet(args: &SheetArgs) -> Result<()> {
     let mut png = std::io::Cursor::new(Vec::new());
     sheet.write_to(&mut png, image::ImageFormat::Png).context("cannot encode the sheet")?;
     tsda_trainer::checkpoint::write_atomic(Path::new(&args.out), png.get_ref())?;
+    for share in maker.sampler().shares() {
+        println!(
+            "source {}: {} sequences, {:.1} % of the samples ({:.1} % across sensors)",
+            share.label,
+            share.sequences,
+            100.0 * (share.same + share.cross),
+            100.0 * share.cross
+        );
+    }
     for (row, sample) in samples.iter().enumerate() {
         println!("row {row}: {}", sample.id);
     }

@@ -327,3 +327,112 @@ fn the_sample_sheet_is_a_picture() {
     assert_eq!((sheet.width(), sheet.height()), (3 * 68 + 4, 3 * 68 + 4));
     assert_eq!(run("none.toml").status.code(), Some(2));
 }
+
+/// The configuration with alignment in force from step 4 of 20.
+fn aligned() -> String {
+    let config = CONFIG
+        .replace("steps = 6", "steps = 20")
+        .replace("validate_every = 3", "validate_every = 10");
+    config + "[align]\npreset = \"joint\"\nstart_step = 4\nramp_steps = 5\nlr = 2e-3\n"
+}
+
+#[test]
+fn a_run_with_alignment_resumes_to_the_bit_and_leaves_nothing_in_its_weights() {
+    let bench = Bench::new();
+    bench.config("joint.toml", &aligned());
+    let whole = bench.trained("joint.toml", "whole", &[]);
+    let stopped = bench.fit("joint.toml", "halves", &["--stop-after", "10"]);
+    assert!(stopped.status.success(), "{}", text(&stopped));
+    assert!(bench.trained("joint.toml", "halves", &["--resume"]) == whole);
+    // The branches too, and their optimiser: one more look at the files they are kept in.
+    for file in ["model.bpk", "ema.bpk", "align.bpk", "align_optim.bpk", "model.safetensors"] {
+        assert!(bench.path("whole/checkpoint-000020").join(file).exists(), "{file}");
+    }
+    let tail = |out: &str| -> Vec<String> {
+        let entries = log(&bench.path(out));
+        let trained = entries.iter().filter(|e| e["event"] == "train" && e["step"] == 20);
+        trained.flat_map(|e| ALIGN_FIGURES.map(|n| e[n].to_string())).collect()
+    };
+    assert_eq!(tail("whole"), tail("halves"));
+
+    // Figures are there from the first step with alignment on, in both logs and on the page.
+    let entries = log(&bench.path("whole"));
+    for e in entries.iter().filter(|e| e["event"] == "train") {
+        let on = e["step"].as_u64() > Some(4);
+        assert!(ALIGN_FIGURES.iter().all(|n| e[n].is_number() == on), "{e}");
+    }
+    let events = std::fs::read_dir(bench.path("whole"))
+        .unwrap()
+        .map(|e| e.unwrap().path())
+        .find(|p| p.to_string_lossy().contains("tfevents"))
+        .unwrap();
+    let scalars = tsda_trainer::logging::read_events(&events).unwrap();
+    for name in ALIGN_FIGURES {
+        let tag = format!("train/{name}");
+        assert_eq!(scalars.iter().filter(|(_, t, _)| *t == tag).count(), 16, "{name}");
+    }
+    let page = std::fs::read_to_string(bench.path("whole/training.html")).unwrap();
+    assert!(page.contains("Discriminator accuracy") && page.contains("joint from step 4"));
+
+    // A row without alignment has the same start, other weights, and tensors of the same names.
+    let cm = bench.trained("joint.toml", "cm", &["--align-preset", "cm"]);
+    let losses = |out: &str| -> Vec<String> {
+        let entries = log(&bench.path(out));
+        entries.iter().filter(|e| e["event"] == "train").map(|e| e["loss"].to_string()).collect()
+    };
+    assert_eq!(losses("cm")[..4], losses("whole")[..4]);
+    assert!(cm != whole);
+    let shapes = |bytes: &[u8]| -> Vec<(String, Vec<usize>)> {
+        let tensors = safetensors::SafeTensors::deserialize(bytes).unwrap();
+        let mut all: Vec<_> =
+            tensors.tensors().into_iter().map(|(n, t)| (n, t.shape().to_vec())).collect();
+        all.sort();
+        all
+    };
+    assert_eq!(shapes(&cm), shapes(&whole));
+    // Bytes as well: no metadata either.
+    assert_eq!(cm.len(), whole.len());
+
+    // Alignment can be added to a checkpoint without; other branches cannot take its place.
+    let output = bench.fit("joint.toml", "cm", &["--resume"]);
+    let all = text(&output);
+    assert!(output.status.success(), "{all}");
+    assert!(all.contains("the branches start fresh") && all.contains("align differs"), "{all}");
+    bench.config("other.toml", &(aligned() + "[align.adversarial]\nhidden = [5]\n"));
+    bench.refused("other.toml", "whole", &["--resume"], &["checkpoint-000020", "[align]"]);
+}
+
+const ALIGN_FIGURES: [&str; 7] = [
+    "adversarial",
+    "adversarial_pull",
+    "contrastive",
+    "contrastive_pull",
+    "discriminator_accuracy",
+    "discriminator_grad_norm",
+    "projection_grad_norm",
+];
+
+#[test]
+fn every_row_of_the_ablation_trains_from_the_command_line() {
+    let bench = Bench::new();
+    let config = CONFIG
+        .replace("validate_every = 3", "validate_every = 4")
+        .replace("validation_samples = 4", "validation_samples = 16");
+    bench.config("rows.toml", &config);
+    let mut seen = std::collections::BTreeSet::new();
+    for row in ["baseline", "cm", "pre-afa", "pre-cfa", "enc-afa", "enc-cfa", "joint"] {
+        let more = ["--align-preset", row, "--align-start", "1", "--steps", "4", "--seed", "3"];
+        let weights = bench.trained("rows.toml", row, &more);
+        assert!(seen.insert(weights), "{row} trains like another row");
+        let entries = log(&bench.path(row));
+        // Every row is validated on the same samples, those across sensors included.
+        let validation = entries.iter().find(|e| e["event"] == "validation").unwrap();
+        let counts = ["same", "cross"].map(|g| validation[g]["samples"].as_u64().unwrap());
+        assert!(counts[0] > 0 && counts[1] > 0, "{row}: {counts:?}");
+        let last = entries.iter().rfind(|e| e["event"] == "train").unwrap();
+        let has = |name: &str| last[name].is_number();
+        assert_eq!(has("adversarial"), row.contains("afa") || row == "joint", "{row}");
+        assert_eq!(has("contrastive"), row.contains("cfa") || row == "joint", "{row}");
+    }
+    bench.refused("rows.toml", "o", &["--align-preset", "joint"], &["align.start_epoch", "step"]);
+}

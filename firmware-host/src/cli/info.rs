@@ -6,7 +6,6 @@ use crate::model;
 use std::fmt::Write as _;
 use std::path::Path;
 use std::time::Instant;
-use tsda_runtime::Backbone;
 use tsda_runtime::bundle::{Bundle, SectionKind};
 use tsda_runtime::engine::AnyEngine;
 use tsda_runtime::probe::{StageTime, stage_times};
@@ -70,12 +69,7 @@ fn describe(path: &str, bundle: &Bundle<'_>) -> String {
     row("name", m.name.to_owned());
     row("size", format!("{} bytes", grouped(bundle.bytes().len() as u64)));
     let s = &m.spec;
-    let backbone = match s.backbone {
-        Backbone::EfficientNetLite0 => "EfficientNet-Lite0 to stride 16".to_owned(),
-        Backbone::ResNet { base_channels, blocks } => {
-            format!("ResNet, {base_channels} channels, blocks {blocks:?}")
-        }
-    };
+    let backbone = s.backbone.to_string();
     row("backbone", backbone);
     row(
         "input",

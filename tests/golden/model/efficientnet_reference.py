@@ -114,4 +114,5 @@ def main():
     print(x.shape, x.std(), np.abs(x).max())
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -158,6 +158,8 @@ impl Target {
             templates: vec![drawn.search.clone(); drawn.templates.len()],
             search: first.clone(),
             region: drawn.region,
+            distractor: None,
+            occluder: None,
         };
         let [mut a, mut b] =
             [drawn, &swapped].map(|drawn| processor.process(drawn, &mut rng.clone()));

@@ -84,32 +84,34 @@ pub fn scatter(title: &str, centred: &[Views], pca: &Pca) -> String {
 }
 
 /// Appends to a text; formatting into a `String` cannot fail.
-fn put(svg: &mut String, text: std::fmt::Arguments<'_>) {
+pub(crate) fn put(svg: &mut String, text: std::fmt::Arguments<'_>) {
     let _ = svg.write_fmt(text);
 }
 
 /// A linear scale with some air on both sides.
-struct Axis {
+pub(crate) struct Axis {
     low: f64,
     high: f64,
     pixels: [f64; 2],
 }
 
 impl Axis {
-    fn new(values: impl Iterator<Item = f64>, pixels: [f64; 2]) -> Self {
+    /// A scale for all values between two positions in the picture.
+    pub fn new(values: impl Iterator<Item = f64>, pixels: [f64; 2]) -> Self {
         let (low, high) = values
             .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
         let air = ((high - low) * 0.05).max(1e-9);
         Self { low: low - air, high: high + air, pixels }
     }
 
-    fn place(&self, value: f64) -> f64 {
+    /// Position of a value.
+    pub fn place(&self, value: f64) -> f64 {
         let share = (value - self.low) / (self.high - self.low);
         self.pixels[0] + share * (self.pixels[1] - self.pixels[0])
     }
 
     /// Some five round values.
-    fn ticks(&self) -> Vec<(f64, String)> {
+    pub fn ticks(&self) -> Vec<(f64, String)> {
         let rough = (self.high - self.low) / 5.0;
         let power = rough.log10().floor();
         let step = [1.0, 2.0, 5.0, 10.0]

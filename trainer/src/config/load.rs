@@ -78,20 +78,36 @@ impl Experiment {
     /// # Errors
     /// Names file, line and field of whatever is wrong.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        Self::load_from(path, None)
+    }
+
+    /// As [`Self::load`]; with `root`, relative paths of data start there, and so do those of
+    /// weights that exist there.
+    ///
+    /// # Errors
+    /// Names file, line and field of whatever is wrong.
+    pub fn load_from(path: &Path, root: Option<&Path>) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path)
             .map_err(|source| ConfigError::Io { path: path.into(), source })?;
         let mut experiment = Self::parse(&text, path)?;
         let beside = path.parent().unwrap_or(Path::new(""));
         for source in &mut experiment.data {
-            source.path = resolve(beside, &source.path);
+            source.path = match root {
+                Some(root) => root.join(&source.path),
+                None => resolve(beside, &source.path),
+            };
         }
+        let weights = |path: &str| {
+            let below = root.map(|root| resolve(root, Path::new(path)));
+            let found = below.filter(|p| p.exists());
+            let found = found.unwrap_or_else(|| resolve(beside, Path::new(path)));
+            found.to_string_lossy().into_owned()
+        };
         if experiment.init.backbone != SCRATCH {
-            let found = resolve(beside, Path::new(&experiment.init.backbone));
-            experiment.init.backbone = found.to_string_lossy().into_owned();
+            experiment.init.backbone = weights(&experiment.init.backbone);
         }
         if !experiment.init.weights.is_empty() {
-            let found = resolve(beside, Path::new(&experiment.init.weights));
-            experiment.init.weights = found.to_string_lossy().into_owned();
+            experiment.init.weights = weights(&experiment.init.weights);
         }
         Ok(experiment)
     }
@@ -123,6 +139,7 @@ impl Experiment {
         let spec = self.model.spec().map_err(|e| write(e.to_string()))?;
         let mut full = self.clone();
         full.model = ModelConfig::from_spec(self.model.preset.clone(), &spec);
+        full.align = self.align.expanded();
         toml::to_string(&full).map_err(|e| write(e.to_string()))
     }
 }

@@ -5,10 +5,15 @@
 //! line and the field. The resolved copy (presets expanded, paths made concrete, overrides applied)
 //! is written beside the results with [`Experiment::to_toml`].
 
+mod align;
 mod load;
 mod model;
 mod validate;
 
+pub use align::{
+    Adversarial, AdversarialConfig, AlignConfig, AlignPreset, AlignStage, Contrastive,
+    ContrastiveConfig,
+};
 pub use load::ConfigError;
 pub use model::ModelConfig;
 pub use validate::FieldError;
@@ -34,6 +39,8 @@ pub struct Experiment {
     pub processing: ProcessingConfig,
     /// Weights of the two losses.
     pub loss: LossConfig,
+    /// Training-only alignment of the two sensors.
+    pub align: AlignConfig,
     /// Optimiser, learning rates, freezing.
     pub optim: OptimConfig,
     /// Weights to start from.
@@ -42,22 +49,16 @@ pub struct Experiment {
     pub run: RunConfig,
 }
 
-/// Layout of a data source.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum DataKind {
-    /// Registered RGB/thermal stills with an `index.json`.
-    Pairs,
-    /// Clips in LasHeR's layout with an `index.json`.
-    Sequences,
-}
-
 /// One set of sequences to draw from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataSource {
-    /// Layout of the folder.
-    pub kind: DataKind,
+    /// Name in logs and on the command line (`--data NAME=DIR`); the kind's name when left out.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub name: String,
+    /// Layout of the folder, as `tsda data-check` and `tsda eval` name it: `KIND[/option..]`
+    /// ([`tsda_eval::dataset::KINDS`]).
+    pub kind: String,
     /// The folder; relative paths are tried beside the configuration file, then from the current
     /// folder.
     pub path: PathBuf,
@@ -67,9 +68,38 @@ pub struct DataSource {
     /// Split validated on; an empty string leaves the source out of validation.
     #[serde(default = "val_split")]
     pub validation_split: String,
-    /// Relative frequency among the sources.
+    /// Share of the samples, relative to the other sources' weights.
     #[serde(default = "one")]
     pub weight: f64,
+    /// Only sequences whose name contains one of these texts; all when empty.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub only: Vec<String>,
+    /// Take part in `sampler.random_region_p`? When left out, sources do whose kind promises
+    /// registered sensors (`pairs`, `pseudo`, `lasher`, `rgbt210`, `antiuav/registered`).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub regions: Option<bool>,
+}
+
+impl DataSource {
+    /// What logs call it.
+    pub fn label(&self) -> &str {
+        if self.name.is_empty() { &self.kind } else { &self.name }
+    }
+
+    /// May targets be random regions?
+    pub fn draws_regions(&self) -> bool {
+        let registered = ["pairs", "pseudo", "lasher", "rgbt210", "antiuav/registered"];
+        self.regions.unwrap_or_else(|| registered.contains(&self.kind.as_str()))
+    }
+
+    /// Sensors that material of this kind can hold: `(RGB, thermal)`.
+    pub fn sensors(&self) -> (bool, bool) {
+        match self.kind.as_str() {
+            "otb" | "got10k" | "coco" | "otb/zero-based" => (true, false),
+            kind if kind.split('/').any(|word| word == "thermal") => (false, true),
+            _ => (true, true),
+        }
+    }
 }
 
 fn train_split() -> String {
@@ -88,22 +118,28 @@ fn one() -> f64 {
 pub struct SamplerConfig {
     /// Template frames per sample; all of one sensor.
     pub templates: usize,
-    /// Chance that the search frame comes from the other sensor.
+    /// Share of samples whose search frame comes from the other sensor, over all sources together.
     pub cross_modal_p: f64,
-    /// Share of samples whose target is a random textured region of a registered pair instead of
-    /// an annotated box.
+    /// Share of the samples of sources that draw regions (`data.regions`) whose target is a random
+    /// textured region instead of an annotated box.
     pub random_region_p: f64,
     /// Smallest side of a random region in pixels.
     pub region_min: f32,
     /// Largest side of a random region in pixels (and never above half the picture's short side).
     pub region_max: f32,
-    /// A region counts as textured when, in every sensor, its mean gradient is at least this share
-    /// of the picture's.
+    /// A region counts as textured when, in every sensor drawn, its mean gradient is at least this
+    /// share of the picture's.
     pub region_texture: f32,
     /// Annotated boxes with a smaller `sqrt(w h)` are not used, in pixels.
     pub min_target: f32,
     /// Largest distance in frames between the base template and any other frame of a video.
     pub gap: usize,
+    /// Chance that a target of another sequence of the source is pasted beside the target in the
+    /// search crop. Training only.
+    pub distractor_p: f64,
+    /// Chance that part of a picture of another sequence of the source covers part of the target in
+    /// the search crop. Training only.
+    pub occluder_p: f64,
     /// Samples that count as one epoch.
     pub samples_per_epoch: usize,
 }
@@ -119,6 +155,8 @@ impl Default for SamplerConfig {
             region_texture: 0.8,
             min_target: 8.0,
             gap: 200,
+            distractor_p: 0.0,
+            occluder_p: 0.0,
             samples_per_epoch: 4000,
         }
     }
@@ -159,6 +197,12 @@ pub struct ProcessingConfig {
     pub crop_flip_p: f64,
     /// Chance that the sample's RGB pictures turn grey.
     pub grayscale_p: f64,
+    /// Chance that the sample's RGB pictures turn into one random mixture of their channels instead,
+    /// which comes nearer to what a thermal camera shows of a coloured thing.
+    pub channel_mix_p: f64,
+    /// Largest share of the target's width and height that an occluder covers
+    /// (`sampler.occluder_p`).
+    pub occluder_side: f32,
     /// Brightness factor is uniform in `1 +- brightness`.
     pub brightness: f32,
     /// Photometric changes of RGB crops.
@@ -178,6 +222,8 @@ impl Default for ProcessingConfig {
             joint_flip_p: 0.5,
             crop_flip_p: 0.5,
             grayscale_p: 0.05,
+            channel_mix_p: 0.0,
+            occluder_side: 0.6,
             brightness: 0.2,
             rgb: PhotometricConfig::default(),
             thermal: PhotometricConfig::default(),
@@ -204,6 +250,15 @@ pub struct PhotometricConfig {
     pub noise_p: f64,
     /// Largest standard deviation of the noise, in grey levels of 0..255.
     pub noise_sigma: f32,
+    /// Chance that grey values are stretched to fill the range, as a thermal camera's automatic gain
+    /// does.
+    pub window_p: f64,
+    /// Largest share of the pixels that the stretch clips, at each end.
+    pub window: f32,
+    /// Chance that a crop is smeared along a random direction.
+    pub motion_blur_p: f64,
+    /// Largest length of the smear, in crop pixels.
+    pub motion_blur: f32,
 }
 
 /// Loss weights (spec 2.5).
@@ -380,6 +435,40 @@ impl Experiment {
         }
         let samples = self.run.epochs.saturating_mul(self.sampler.samples_per_epoch as u64);
         samples.div_ceil(self.run.batch.max(1) as u64)
+    }
+
+    /// First step with alignment losses (0-based), whether or not the run has any.
+    pub fn align_start(&self) -> u64 {
+        let samples = self.align.start_epoch.saturating_mul(self.sampler.samples_per_epoch as u64);
+        self.align.start_step.unwrap_or_else(|| samples.div_ceil(self.run.batch.max(1) as u64))
+    }
+
+    /// Share of the alignment weights in force at a step, 0 to 1; `None` before alignment starts
+    /// and in runs without.
+    pub fn align_factor(&self, step: u64) -> Option<f64> {
+        let done = step.checked_sub(self.align_start()).filter(|_| self.align.is_on())?;
+        let ramp = self.align.ramp_steps.max(1);
+        Some(((done + 1) as f64 / ramp as f64).min(1.0))
+    }
+
+    /// Would `other` align in another way? However the two tables say it.
+    pub fn align_differs(&self, other: &Self) -> bool {
+        let said = |e: &Self| {
+            let on = e.align.is_on();
+            let when = on.then(|| (e.align_start(), e.align.ramp_steps, e.align.lr));
+            let alone = e.align.preset == AlignPreset::Baseline;
+            (e.align.adversarial(), e.align.contrastive(), when, alone)
+        };
+        said(self) != said(other)
+    }
+
+    /// How training samples are drawn: `[sampler]`, or with one sensor only in the baseline row.
+    pub fn training_sampler(&self) -> SamplerConfig {
+        let mut sampler = self.sampler.clone();
+        if self.align.preset == AlignPreset::Baseline {
+            sampler.cross_modal_p = 0.0;
+        }
+        sampler
     }
 }
 

@@ -7,7 +7,7 @@ use tsda_runtime::{Backbone, ModelSpec, SpecError};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelConfig {
-    /// `nano` (the default), `tomp50` or `tomp101`.
+    /// `nano` (the default), `pico`, `pico-v3`, `tomp50` or `tomp101`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub preset: Option<String>,
     /// See [`ModelSpec::crop`].
@@ -46,13 +46,13 @@ pub struct ModelConfig {
     /// See [`ModelSpec::label_sigma`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub label_sigma: Option<f32>,
-    /// See [`ModelSpec::input_mean`].
+    /// See [`ModelSpec::input_mean`]; when not given, the preset's, or what another backbone wants.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub input_mean: Option<[f32; 3]>,
     /// See [`ModelSpec::input_std`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub input_std: Option<[f32; 3]>,
-    /// See [`ModelSpec::backbone`]: `"efficient_net_lite0"` or
+    /// See [`ModelSpec::backbone`]: `"efficient_net_lite0"`, `"nanotrack_v2"`, `"nanotrack_v3"` or
     /// `{ res_net = { base_channels = 64, blocks = [3, 4, 6] } }`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub backbone: Option<Backbone>,
@@ -69,8 +69,13 @@ impl ModelConfig {
             Some(name) => ModelSpec::preset(name).ok_or(SpecError {
                 field: "preset",
                 value: f32::NAN,
-                want: "\"nano\", \"tomp50\" or \"tomp101\"",
+                want: "\"nano\", \"pico\", \"pico-v3\", \"tomp50\" or \"tomp101\"",
             })?,
+        };
+        // Another backbone wants its own input, whatever the preset has.
+        let (mean, std) = match self.backbone {
+            Some(backbone) if backbone != base.backbone => backbone.input_statistics(),
+            _ => (base.input_mean, base.input_std),
         };
         let spec = ModelSpec {
             backbone: self.backbone.unwrap_or(base.backbone),
@@ -86,8 +91,8 @@ impl ModelConfig {
             test_embedding: self.test_embedding.unwrap_or(base.test_embedding),
             templates: self.templates.unwrap_or(base.templates),
             label_sigma: self.label_sigma.unwrap_or(base.label_sigma),
-            input_mean: self.input_mean.unwrap_or(base.input_mean),
-            input_std: self.input_std.unwrap_or(base.input_std),
+            input_mean: self.input_mean.unwrap_or(mean),
+            input_std: self.input_std.unwrap_or(std),
         };
         spec.validate()?;
         Ok(spec)

@@ -1,10 +1,10 @@
 //! Range checks of every field, each naming the field as it is written in the file.
 
 use super::{
-    DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig, ProcessingConfig,
-    RunConfig, SamplerConfig, ScheduleConfig,
+    AlignPreset, DataSource, Experiment, JitterConfig, OptimConfig, PhotometricConfig,
+    ProcessingConfig, RunConfig, SamplerConfig, ScheduleConfig,
 };
-use tsda_eval::dataset::Split;
+use tsda_eval::dataset::{KINDS, Kind, Split, kind_of};
 use tsda_runtime::SpecError;
 
 /// A field whose value cannot be used.
@@ -67,6 +67,11 @@ impl Experiment {
         }
         for (i, source) in self.data.iter().enumerate() {
             check_source(i, source)?;
+            let twin = |s: &DataSource| !s.name.is_empty() && s.name == source.name;
+            if self.data[..i].iter().any(twin) {
+                let field = format!("data.{i}.name");
+                return fail(&field, format!("{:?}", source.name), "a name no other source has");
+            }
         }
         check_sampler(&self.sampler)?;
         if self.sampler.templates > usize::from(spec.templates) {
@@ -84,11 +89,24 @@ impl Experiment {
             return fail("init.backbone", "\"\"", "a path or \"scratch\"");
         }
         check_run(&self.run)?;
-        count("run.steps (or run.epochs)", self.total_steps(), 1, 100_000_000)
+        count("run.steps (or run.epochs)", self.total_steps(), 1, 100_000_000)?;
+        check_align(self)
     }
 }
 
 fn check_source(i: usize, source: &DataSource) -> Result<(), FieldError> {
+    if kind_of(&source.kind).is_err() {
+        let all = KINDS.iter().map(Kind::to_string).collect::<Vec<_>>().join(", ");
+        let value = format!("{:?}", source.kind);
+        return fail(&format!("data.{i}.kind"), value, &format!("one of {all}"));
+    }
+    if source.name.contains(['=', '/', '\\']) {
+        let value = format!("{:?}", source.name);
+        return fail(&format!("data.{i}.name"), value, "a name without '=', '/' and '\\'");
+    }
+    if source.only.iter().any(String::is_empty) {
+        return fail(&format!("data.{i}.only"), "[\"\"]", "a list of non-empty texts");
+    }
     positive(&format!("data.{i}.weight"), source.weight)?;
     for (field, name, optional) in
         [("split", &source.split, false), ("validation_split", &source.validation_split, true)]
@@ -116,6 +134,8 @@ fn check_sampler(s: &SamplerConfig) -> Result<(), FieldError> {
     within("sampler.region_texture", s.region_texture.into(), 0.0, 10.0)?;
     within("sampler.min_target", s.min_target.into(), 1.0, 4096.0)?;
     count("sampler.gap", s.gap as u64, 1, 1_000_000)?;
+    share("sampler.distractor_p", s.distractor_p)?;
+    share("sampler.occluder_p", s.occluder_p)?;
     count("sampler.samples_per_epoch", s.samples_per_epoch as u64, 1, 1_000_000_000)
 }
 
@@ -132,7 +152,11 @@ fn check_photometric(name: &str, p: &PhotometricConfig) -> Result<(), FieldError
     share(&format!("processing.{name}.blur_p"), p.blur_p)?;
     within(&format!("processing.{name}.blur_sigma"), p.blur_sigma.into(), 0.0, 10.0)?;
     share(&format!("processing.{name}.noise_p"), p.noise_p)?;
-    within(&format!("processing.{name}.noise_sigma"), p.noise_sigma.into(), 0.0, 128.0)
+    within(&format!("processing.{name}.noise_sigma"), p.noise_sigma.into(), 0.0, 128.0)?;
+    share(&format!("processing.{name}.window_p"), p.window_p)?;
+    within(&format!("processing.{name}.window"), p.window.into(), 0.0, 0.4)?;
+    share(&format!("processing.{name}.motion_blur_p"), p.motion_blur_p)?;
+    within(&format!("processing.{name}.motion_blur"), p.motion_blur.into(), 0.0, 64.0)
 }
 
 fn check_processing(p: &ProcessingConfig) -> Result<(), FieldError> {
@@ -142,6 +166,8 @@ fn check_processing(p: &ProcessingConfig) -> Result<(), FieldError> {
     share("processing.joint_flip_p", p.joint_flip_p)?;
     share("processing.crop_flip_p", p.crop_flip_p)?;
     share("processing.grayscale_p", p.grayscale_p)?;
+    share("processing.channel_mix_p", p.channel_mix_p)?;
+    within("processing.occluder_side", p.occluder_side.into(), 0.1, 0.9)?;
     within("processing.brightness", p.brightness.into(), 0.0, 0.9)?;
     check_photometric("rgb", &p.rgb)?;
     check_photometric("thermal", &p.thermal)?;
@@ -175,6 +201,56 @@ fn check_optim(o: &OptimConfig) -> Result<(), FieldError> {
     }
     within("optim.dropout", o.dropout, 0.0, 0.95)?;
     within("optim.attention_dropout", o.attention_dropout, 0.0, 0.95)?;
+    Ok(())
+}
+
+fn check_hidden(field: &str, hidden: &[usize]) -> Result<(), FieldError> {
+    count(field, hidden.len() as u64, 0, 8)?;
+    hidden.iter().try_for_each(|width| count(field, *width as u64, 1, 1 << 16))
+}
+
+fn check_align(e: &Experiment) -> Result<(), FieldError> {
+    let a = &e.align;
+    let preset = || format!("\"{}\"", a.preset.name());
+    if let Some(b) = a.adversarial() {
+        within("align.adversarial.weight", b.weight, 0.0, 1e3)?;
+        within("align.adversarial.reversal", b.reversal, 0.0, 1e3)?;
+        check_hidden("align.adversarial.hidden", &b.hidden)?;
+    }
+    if let Some(b) = a.contrastive() {
+        within("align.contrastive.weight", b.weight, 0.0, 1e3)?;
+        within("align.contrastive.temperature", b.temperature, 1e-3, 1e3)?;
+        check_hidden("align.contrastive.hidden", &b.hidden)?;
+        count("align.contrastive.dim", b.dim as u64, 1, 1 << 16)?;
+        if e.run.batch < 2 {
+            let want = "at least 2: the contrastive loss compares the samples of a batch";
+            return fail("run.batch", e.run.batch, want);
+        }
+    }
+    if let Some(lr) = a.lr {
+        within("align.lr", lr, 0.0, 1.0)?;
+    }
+    match a.preset {
+        AlignPreset::None => {}
+        AlignPreset::Baseline | AlignPreset::Cm if a.is_on() => {
+            return fail("align.preset", preset(), "a row with alignment, or without its tables");
+        }
+        AlignPreset::Baseline => {}
+        _ if e.sampler.cross_modal_p == 0.0 => {
+            let want = "above 0 for every align.preset but \"none\" and \"baseline\"";
+            return fail("sampler.cross_modal_p", 0, want);
+        }
+        _ => {}
+    }
+    let (start, total) = (e.align_start(), e.total_steps());
+    if a.is_on() && start >= total {
+        let field = if a.start_step.is_some() { "align.start_step" } else { "align.start_epoch" };
+        let value = a.start_step.unwrap_or(a.start_epoch);
+        let want =
+            format!("before the end of the run: alignment would start at step {start} of {total}");
+        let want = want + " (runs counted in steps: set align.start_step or give --align-start)";
+        return fail(field, value, &want);
+    }
     Ok(())
 }
 

@@ -4,28 +4,33 @@
 //! generator, which dropout reads. Learning rates are a function of the step. So a run that was
 //! stopped and resumed ends with the same weights, bit for bit, as one that was not.
 
+mod alignment;
+mod curves;
 mod evaluate;
 mod optim;
 mod progress;
 mod state;
+mod step;
 #[cfg(test)]
 mod step_tests;
 mod tensors;
+mod throughput;
 
 pub use evaluate::{Group, Validation, best_box};
 pub use optim::lr_factor;
+pub use throughput::{Throughput, throughput};
 
+use crate::align::Figures;
 use crate::checkpoint::{CheckpointError, CheckpointStore, write_atomic};
 use crate::config::{ConfigError, Experiment, SCRATCH};
 use crate::import::{self, WeightsError};
 use crate::logging::RunLog;
-use crate::losses::{LossWeights, losses};
+use crate::losses::LossWeights;
 use crate::model::{NetOptions, TrackerNet};
 use crate::prefetch::{PrefetchError, Prefetcher};
-use crate::processing::{Batch, BatchMaker, Processor};
+use crate::processing::{BatchMaker, Processor};
 use crate::sampler::{PictureCache, SampleError, Sampler};
 use burn::module::Module;
-use burn::optim::GradientsParams;
 use burn::prelude::*;
 use progress::{Progress, Window};
 use serde::Serialize;
@@ -34,7 +39,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
-use tensors::Inputs;
+use step::{Rates, train_step};
 use tsda_runtime::SpecError;
 
 /// Keeps the validation samples apart from the training ones of the same seed.
@@ -112,7 +117,7 @@ pub enum FitError {
     NotFinite {
         /// The step.
         step: u64,
-        /// `loss` or `gradient norm`.
+        /// `loss`, `alignment loss`, `gradient norm` or the name of a branch's norm in the log.
         what: &'static str,
         /// Its value.
         value: f32,
@@ -181,6 +186,9 @@ struct StepEntry {
     lr: f64,
     samples_per_s: f64,
     data_wait: f64,
+    /// While alignment is on.
+    #[serde(flatten)]
+    align: Figures,
 }
 
 #[derive(Serialize)]
@@ -210,7 +218,10 @@ fn sampler(
     cache: &Arc<PictureCache>,
     validation: bool,
 ) -> Result<Sampler, SampleError> {
-    Sampler::open(&experiment.data, &experiment.sampler, cache.clone(), validation)
+    // Every row of an ablation is validated on the same samples.
+    let config =
+        if validation { experiment.sampler.clone() } else { experiment.training_sampler() };
+    Sampler::open(&experiment.data, &config, cache.clone(), validation)
 }
 
 /// The batches a configuration trains on.
@@ -269,7 +280,7 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
     let maker = Arc::new(training_batches(experiment)?);
     let validation = validation_batches(experiment)?;
     let device = options.device.clone().autodiff();
-    let mut state = State::start(experiment, initial_net(experiment, &device)?);
+    let mut state = State::start(experiment, initial_net(experiment, &device)?, &device);
     let mut notes = Vec::new();
     if options.resume {
         let latest = store.latest()?;
@@ -317,8 +328,11 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
         let step = state.step;
         device.seed(mix(run.seed, step));
         let factor = lr_factor(&experiment.optim, step, total);
-        let rate = optim::learning_rate(&experiment.optim, &backbone, factor);
-        let figures = match train_step(&mut state, &batch, experiment, weights, rate, &device) {
+        let rates = Rates {
+            net: optim::learning_rate(&experiment.optim, &backbone, factor),
+            align: experiment.align.lr.unwrap_or(experiment.optim.lr_head) * factor,
+        };
+        let figures = match train_step(&mut state, &batch, experiment, weights, rates, &device) {
             Ok(figures) => figures,
             Err(e) => {
                 if let FitError::NotFinite { what, ids, .. } = &e {
@@ -335,7 +349,7 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
         if state.step.is_multiple_of(run.log_every) || state.step == end {
             let e = window.take(experiment.optim.lr_head * factor);
             progress.entry(state.step, &e);
-            let scalars = [
+            let mut scalars = vec![
                 ("loss", e.loss),
                 ("cls", e.cls),
                 ("giou", e.giou),
@@ -344,6 +358,7 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
                 ("samples_per_s", e.samples_per_s),
                 ("data_wait", e.data_wait),
             ];
+            scalars.extend(e.align.iter().map(|(name, value)| (*name, *value)));
             log.entry("train", state.step, &e, &scalars).map_err(log_error)?;
         }
         let due =
@@ -380,6 +395,7 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
         state.save(&store, &resolved)?;
     }
     progress.finish();
+    curves::write(experiment)?;
     if state.step < total {
         return Ok(Outcome::Stopped { step: state.step });
     }
@@ -416,57 +432,6 @@ fn create_folder(path: &Path) -> Result<(), FitError> {
         path: path.to_owned(),
         source,
     })
-}
-
-/// Figures of one step.
-#[derive(Clone, Copy, Debug, Default)]
-struct StepFigures {
-    loss: f64,
-    cls: f64,
-    giou: f64,
-    grad_norm: f64,
-}
-
-fn train_step(
-    state: &mut State,
-    batch: &Batch,
-    experiment: &Experiment,
-    weights: LossWeights,
-    rate: burn::lr_scheduler::module_lr_scheduler::ModuleLearningRate,
-    device: &Device,
-) -> Result<StepFigures, FitError> {
-    let step = state.step;
-    let finite = |what: &'static str, value: f32| {
-        if value.is_finite() {
-            return Ok(f64::from(value));
-        }
-        Err(FitError::NotFinite { step, what, value, ids: batch.ids.clone() })
-    };
-    let inputs = Inputs::new(batch, state.net.spec(), device);
-    let output = state.net.forward_train(
-        inputs.template_crops,
-        inputs.search_crops,
-        inputs.template_labels,
-        inputs.template_ltrb,
-    );
-    let l = losses(
-        weights,
-        output.scores,
-        inputs.search_labels,
-        output.ltrb,
-        inputs.search_ltrb,
-        &batch.region,
-    );
-    let loss = finite("loss", l.total.clone().into_scalar::<f32>())?;
-    let cls = f64::from(l.classification.into_scalar::<f32>());
-    let giou = f64::from(l.giou.into_scalar::<f32>());
-    let gradients = GradientsParams::from_grads(l.total.backward(), &state.net);
-    let gradients = optim::complete(&state.net, gradients);
-    let norm = optim::gradient_norm(&state.net, &gradients);
-    let grad_norm = finite("gradient norm", norm)?;
-    let gradients = optim::clip(&state.net, gradients, norm, experiment.optim.clip_norm);
-    state.update(rate, gradients, experiment.optim.ema_decay);
-    Ok(StepFigures { loss, cls, giou, grad_norm })
 }
 
 #[cfg(test)]

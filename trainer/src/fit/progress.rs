@@ -1,6 +1,8 @@
 //! What a person sees while it trains, and the means over the steps between two log entries.
 
-use super::{StepEntry, StepFigures, Validation};
+use super::step::StepFigures;
+use super::{StepEntry, Validation};
+use crate::align::Figures;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -10,6 +12,8 @@ pub(super) struct Window {
     batch: usize,
     sum: StepFigures,
     steps: usize,
+    /// Steps with alignment.
+    aligned: usize,
     /// Time spent in steps, without validations and checkpoints.
     busy: Duration,
     waited: Duration,
@@ -26,6 +30,7 @@ impl Window {
             batch,
             sum: StepFigures::default(),
             steps: 0,
+            aligned: 0,
             busy: Duration::ZERO,
             waited: Duration::ZERO,
             last: Instant::now(),
@@ -46,6 +51,10 @@ impl Window {
         self.sum.cls += figures.cls;
         self.sum.giou += figures.giou;
         self.sum.grad_norm += figures.grad_norm;
+        self.aligned += usize::from(!figures.align.is_empty());
+        for (name, value) in &figures.align {
+            *self.sum.align.entry(name).or_default() += value;
+        }
         self.newest = figures;
         let now = Instant::now();
         self.busy += now - self.last;
@@ -67,21 +76,33 @@ impl Window {
     pub fn take(&mut self, lr: f64) -> StepEntry {
         let n = self.steps.max(1) as f64;
         let (samples_per_s, data_wait) = self.rates();
+        let sums = std::mem::take(&mut self.sum);
+        let aligned = self.aligned.max(1) as f64;
         let entry = StepEntry {
-            loss: self.sum.loss / n,
-            cls: self.sum.cls / n,
-            giou: self.sum.giou / n,
-            grad_norm: self.sum.grad_norm / n,
+            loss: sums.loss / n,
+            cls: sums.cls / n,
+            giou: sums.giou / n,
+            grad_norm: sums.grad_norm / n,
             lr,
             samples_per_s,
             data_wait,
+            align: sums.align.into_iter().map(|(name, sum)| (name, sum / aligned)).collect(),
         };
-        self.sum = StepFigures::default();
         self.steps = 0;
+        self.aligned = 0;
         self.busy = Duration::ZERO;
         self.waited = Duration::ZERO;
         entry
     }
+}
+
+/// The alignment losses and the discriminator's accuracy, where there are any.
+fn alignment(figures: &Figures) -> String {
+    let short = [("adversarial", "bce"), ("discriminator_accuracy", "acc"), ("contrastive", "nce")];
+    short
+        .iter()
+        .filter_map(|(name, short)| figures.get(name).map(|v| format!(" {short} {v:.3}")))
+        .collect()
 }
 
 /// A bar on a terminal, plain lines elsewhere.
@@ -124,10 +145,11 @@ impl Progress {
         let (rate, wait) = window.shown;
         let f = &window.newest;
         bar.set_message(format!(
-            "loss {:.3} cls {:.5} giou {:.3} | {rate:.1} samples/s, data wait {:.0} %",
+            "loss {:.3} cls {:.5} giou {:.3}{} | {rate:.1} samples/s, data wait {:.0} %",
             f.loss,
             f.cls,
             f.giou,
+            alignment(&f.align),
             100.0 * wait
         ));
         bar.set_position(step);
@@ -140,11 +162,12 @@ impl Progress {
         let done = (step - self.first).max(1) as f64;
         let left = self.start.elapsed().as_secs_f64() / done * (self.total - step) as f64;
         eprintln!(
-            "step {step}/{}  loss {:.3}  cls {:.5}  giou {:.3}  grad {:.2}  lr {:.1e}  {:.1} samples/s  data wait {:.0} %  left {:.0} min",
+            "step {step}/{}  loss {:.3}  cls {:.5}  giou {:.3} {}  grad {:.2}  lr {:.1e}  {:.1} samples/s  data wait {:.0} %  left {:.0} min",
             self.total,
             e.loss,
             e.cls,
             e.giou,
+            alignment(&e.align),
             e.grad_norm,
             e.lr,
             e.samples_per_s,

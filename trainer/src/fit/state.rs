@@ -1,5 +1,6 @@
 //! What changes from step to step, and how it is kept.
 
+use super::alignment::Alignment;
 use super::{FitError, optim};
 use crate::checkpoint::{Checkpoint, CheckpointError, CheckpointStore, write_atomic};
 use crate::config::Experiment;
@@ -8,6 +9,7 @@ use crate::model::TrackerNet;
 use burn::lr_scheduler::module_lr_scheduler::ModuleLearningRate;
 use burn::module::Module;
 use burn::optim::{GradientsParams, ModuleOptimizer};
+use burn::prelude::*;
 use burn::store::ModuleRecord;
 use burn::tensor::Bytes;
 use serde::{Deserialize, Serialize};
@@ -27,19 +29,22 @@ struct Header {
     config: String,
 }
 
-/// Network, optimiser, running average and the number of steps done.
+/// Network, alignment branches, optimisers, running average and the number of steps done.
 pub(super) struct State {
     pub net: TrackerNet,
     pub step: u64,
+    /// Branches that exist in training only.
+    pub align: Option<Alignment>,
     optimizer: ModuleOptimizer,
     /// Running average of the weights, without autodiff.
     average: Option<TrackerNet>,
 }
 
 impl State {
-    pub fn start(experiment: &Experiment, net: TrackerNet) -> Self {
+    pub fn start(experiment: &Experiment, net: TrackerNet, device: &Device) -> Self {
         let average = (experiment.optim.ema_decay > 0.0).then(|| net.valid());
-        Self { net, step: 0, optimizer: optim::optimizer(&experiment.optim), average }
+        let align = Alignment::start(experiment, net.spec().width.into(), device);
+        Self { net, step: 0, align, optimizer: optim::optimizer(&experiment.optim), average }
     }
 
     /// One optimiser step.
@@ -63,6 +68,9 @@ impl State {
             if let Some(average) = &self.average {
                 put_record(folder, AVERAGE, average.clone().into_record().into_bytes())?;
             }
+            if let Some(align) = &self.align {
+                align.save(folder)?;
+            }
             let header = Header { step: self.step, config: config.to_owned() };
             let text = serde_json::to_vec_pretty(&header)
                 .map_err(|e| FitError::Device(format!("cannot write {STATE}: {e}")))?;
@@ -85,15 +93,11 @@ impl State {
         if then.model_spec()? != experiment.model_spec()? {
             return Err(unfit("it holds a network of another [model]".into()));
         }
-        let record = |name: &str| -> Result<ModuleRecord, FitError> {
-            ModuleRecord::from_bytes(Bytes::from_bytes_vec(checkpoint.read(name)?))
-                .map_err(|e| unfit(format!("{name}: {e}")))
-        };
         // Parameters get the ids they had, by which the optimiser's state is found.
         self.net = self
             .net
             .clone()
-            .try_load_record(record(MODEL)?)
+            .try_load_record(read_record(checkpoint, MODEL)?)
             .map_err(|e| unfit(format!("{MODEL}: {e}")))?;
         self.optimizer = optim::optimizer(&experiment.optim)
             .from_bytes(Bytes::from_bytes_vec(checkpoint.read(OPTIM)?))
@@ -102,14 +106,18 @@ impl State {
             let average = self.net.valid();
             self.average = Some(if checkpoint.has(AVERAGE) {
                 average
-                    .try_load_record(record(AVERAGE)?)
+                    .try_load_record(read_record(checkpoint, AVERAGE)?)
                     .map_err(|e| unfit(format!("{AVERAGE}: {e}")))?
             } else {
                 average
             });
         }
         self.step = header.step;
-        Ok(changes(&then, experiment))
+        let mut notes = changes(&then, experiment);
+        if let Some(align) = &mut self.align {
+            notes.extend(align.load(experiment, &then.align, checkpoint)?);
+        }
+        Ok(notes)
     }
 }
 
@@ -120,6 +128,7 @@ fn changes(then: &Experiment, now: &Experiment) -> Vec<String> {
         ("sampler", then.sampler != now.sampler),
         ("processing", then.processing != now.processing),
         ("loss", then.loss != now.loss),
+        ("align", then.align_differs(now)),
         ("optim", then.optim != now.optim),
         ("run.seed", then.run.seed != now.run.seed),
         ("run.batch", then.run.batch != now.run.batch),
@@ -132,7 +141,15 @@ fn changes(then: &Experiment, now: &Experiment) -> Vec<String> {
         .collect()
 }
 
-fn put_record<E: std::fmt::Display>(
+/// A record of a checkpoint.
+pub(super) fn read_record(checkpoint: &Checkpoint, name: &str) -> Result<ModuleRecord, FitError> {
+    ModuleRecord::from_bytes(Bytes::from_bytes_vec(checkpoint.read(name)?)).map_err(|e| {
+        FitError::Resume { path: checkpoint.path.clone(), reason: format!("{name}: {e}") }
+    })
+}
+
+/// Writes a record into a checkpoint's folder.
+pub(super) fn put_record<E: std::fmt::Display>(
     folder: &Path,
     name: &str,
     bytes: Result<Bytes, E>,

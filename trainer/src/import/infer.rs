@@ -10,7 +10,7 @@ use crate::config::{ConfigError, ModelConfig};
 use tsda_runtime::{Backbone, ModelSpec, TrackerParams};
 
 /// Presets whose shapes files are compared with.
-const PRESETS: [&str; 4] = ["tomp101", "tomp50", "nano", "small"];
+const PRESETS: [&str; 6] = ["tomp101", "tomp50", "nano", "pico", "pico-v3", "small"];
 
 /// What the user says about the network.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -79,6 +79,8 @@ pub fn spec_fields(spec: &ModelSpec) -> [(&'static str, String); 15] {
         Backbone::ResNet { base_channels, blocks: [a, b, c] } => {
             format!("ResNet, {base_channels} channels, blocks {a}-{b}-{c}")
         }
+        Backbone::NanoTrackV2 => "NanoTrack v2".into(),
+        Backbone::NanoTrackV3 => "NanoTrack v3".into(),
     };
     [
         ("backbone", backbone),
@@ -117,6 +119,10 @@ pub fn backbone(dict: &StateDict, prefix: &str) -> Option<Backbone> {
     let at = |name: &str| format!("{prefix}{name}");
     if dict.get(&at("_conv_stem.weight")).is_some() {
         return Some(Backbone::EfficientNetLite0);
+    }
+    if dict.get(&at("features.1.conv.0.weight")).is_some() {
+        let ninth = dict.names().any(|name| name.starts_with(&at("features.9.")));
+        return Some(if ninth { Backbone::NanoTrackV3 } else { Backbone::NanoTrackV2 });
     }
     let base_channels = rows(dict, &at("conv1.weight"))?;
     let stage = |n| count(dict, &at(&format!("layer{n}.")), ".conv3.weight");
@@ -242,6 +248,8 @@ pub fn infer(
         (None, None, Some((name, spec))) => (spec, format!("preset {name}, whose shapes it has")),
         (None, None, None) => match seen.backbone {
             Some(Backbone::EfficientNetLite0) => (ModelSpec::NANO, "preset nano".into()),
+            Some(Backbone::NanoTrackV2) => (ModelSpec::PICO, "preset pico".into()),
+            Some(Backbone::NanoTrackV3) => (ModelSpec::PICO_V3, "preset pico-v3".into()),
             _ => (ModelSpec::TOMP50, "preset tomp50".into()),
         },
     };

@@ -6,7 +6,7 @@
 //! by name. Writing goes to a temporary name first and renames at the end.
 //!
 //! * [`save_weights`], [`load_weights`]: a whole [`TrackerNet`];
-//! * [`load_backbone`]: ImageNet weights for the backbone of a fresh net;
+//! * [`load_backbone`]: pretrained weights for the backbone of a fresh net;
 //! * [`run`]: the command `tsda-train weights-import`.
 
 mod command;
@@ -86,7 +86,7 @@ pub enum WeightsError {
     /// A whole network was asked for, but the file has no head.
     #[error(
         "it holds no head, so it is no {kind} file; backbones are imported with --kind \
-         torchvision-resnet or efficientnet-lite0 ({})", path.display()
+         torchvision-resnet, efficientnet-lite0 or nanotrack ({})", path.display()
     )]
     NoHead {
         /// `pytracking`, `full`.
@@ -224,8 +224,8 @@ pub fn load_weights(
 }
 
 /// Reads the backbone of `net` from a file of backbone weights (safetensors, or PyTorch as
-/// torchvision has them), with or without the `feature_extractor.` prefix, or from a whole network's
-/// file. The head stays as it is.
+/// torchvision has them, or a NanoTrack state dict), with or without the `feature_extractor.` prefix,
+/// or from a whole network's file. The head stays as it is.
 ///
 /// # Errors
 /// When the file cannot be read or lacks a tensor of the backbone.
@@ -234,7 +234,7 @@ pub fn load_backbone(
     path: &Path,
 ) -> Result<(TrackerNet, ImportReport), WeightsError> {
     let mut dict = StateDict::read(path)?;
-    command::add_prefix(&mut dict);
+    command::adopt(&mut dict);
     apply(net, &dict, BACKBONE)
         .map_err(|source| WeightsError::Tensors { source, path: path.into() })
 }

@@ -1,6 +1,7 @@
 //! The feature extractor and which of its layers train.
 
 use super::efficientnet::{BLOCKS, EfficientNetLite0};
+use super::mobilenet::{BEFORE_STRIDE16, BLOCKS_V2, BLOCKS_V3, MobileNetV3};
 use super::resnet::ResNet;
 use burn::module::ParamGroup;
 use burn::prelude::*;
@@ -15,11 +16,11 @@ use tsda_runtime::Backbone;
 #[serde(rename_all = "snake_case")]
 pub enum FreezePolicy {
     /// Everything before the stride-16 layers: ResNet stem, layer1 and layer2 (as in ToMP);
-    /// EfficientNet stem and blocks 0 to 4.
+    /// EfficientNet stem and blocks 0 to 4; MobileNet stem and blocks 0 to 2.
     #[default]
     BeforeStride16,
     /// Stem and the first `n` groups: stages of a ResNet (0 to 3), blocks of an EfficientNet
-    /// (0 to 11). Larger numbers mean all.
+    /// (0 to 11) or of NanoTrack's MobileNet (0 to 8 in v2, to 9 in v3). Larger numbers mean all.
     Leading(u8),
     /// The whole backbone.
     All,
@@ -32,6 +33,8 @@ impl FreezePolicy {
     pub(crate) fn frozen_groups(self, backbone: &Backbone) -> usize {
         let (groups, before_stride16) = match backbone {
             Backbone::EfficientNetLite0 => (1 + BLOCKS, 1 + 5),
+            Backbone::NanoTrackV2 => (1 + BLOCKS_V2, 1 + BEFORE_STRIDE16),
+            Backbone::NanoTrackV3 => (1 + BLOCKS_V3, 1 + BEFORE_STRIDE16),
             Backbone::ResNet { .. } => (1 + 3, 1 + 2),
         };
         match self {
@@ -51,6 +54,11 @@ impl FreezePolicy {
             Backbone::EfficientNetLite0 => (r"^feature_extractor\.\w+\.(conv_stem|bn0)\.", |i| {
                 format!(r"^feature_extractor\.\w+\.blocks\.{i}\.")
             }),
+            Backbone::NanoTrackV2 | Backbone::NanoTrackV3 => {
+                (r"^feature_extractor\.\w+\.(stem|bn)\.", |i| {
+                    format!(r"^feature_extractor\.\w+\.blocks\.{i}\.")
+                })
+            }
             Backbone::ResNet { .. } => (r"^feature_extractor\.\w+\.(conv1|bn1)\.", |i| {
                 format!(r"^feature_extractor\.\w+\.layer{}\.", i + 1)
             }),
@@ -76,12 +84,15 @@ impl FreezePolicy {
 
 /// One of the feature extractors of [`Backbone`].
 #[derive(Module, Debug)]
-#[allow(clippy::large_enum_variant)] // One per program.
+// One per program; the names are the networks' own.
+#[allow(clippy::large_enum_variant, clippy::enum_variant_names)]
 pub(crate) enum BackboneNet {
     /// See [`EfficientNetLite0`].
     EfficientNet(EfficientNetLite0),
     /// See [`ResNet`].
     ResNet(ResNet),
+    /// See [`MobileNetV3`].
+    MobileNet(MobileNetV3),
 }
 
 impl BackboneNet {
@@ -89,6 +100,8 @@ impl BackboneNet {
     pub fn new(backbone: &Backbone, device: &Device) -> Self {
         match *backbone {
             Backbone::EfficientNetLite0 => Self::EfficientNet(EfficientNetLite0::new(device)),
+            Backbone::NanoTrackV2 => Self::MobileNet(MobileNetV3::new(BLOCKS_V2, device)),
+            Backbone::NanoTrackV3 => Self::MobileNet(MobileNetV3::new(BLOCKS_V3, device)),
             Backbone::ResNet { base_channels, blocks } => {
                 Self::ResNet(ResNet::new(base_channels.into(), blocks, device))
             }
@@ -100,6 +113,7 @@ impl BackboneNet {
         match self {
             Self::EfficientNet(net) => net.forward(x, frozen),
             Self::ResNet(net) => net.forward(x, frozen),
+            Self::MobileNet(net) => net.forward(x, frozen),
         }
     }
 
@@ -108,6 +122,7 @@ impl BackboneNet {
     pub fn forward_wide(&self, x: Tensor<4>, frozen: usize) -> Tensor<4> {
         match self {
             Self::EfficientNet(net) if frozen > 0 => net.forward_wide(x, frozen),
+            Self::MobileNet(net) if frozen > 0 => net.forward_wide(x, frozen),
             _ => self.forward(x, frozen).permute([1, 0, 2, 3]),
         }
     }

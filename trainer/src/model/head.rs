@@ -270,7 +270,8 @@ impl Head {
         Tensor::cat(vec![tokens, projected], 2)
     }
 
-    /// [`Self::predict_filter`] from prepared frames `(B, frames * F*F, 4d)`.
+    /// Filter `(B, d)` and encoded search frame `(B, F*F, d)` from prepared frames
+    /// `(B, frames * F*F, 4d)`, the search frame last.
     pub fn predict_filter_prepared(
         &self,
         prepared: Tensor<3>,
@@ -285,12 +286,13 @@ impl Head {
         self.decode(memory, position)
     }
 
-    /// Filter `(B, d)` and encoded search frame `(B, F*F, d)` from tokens `(B, frames * F*F, d)`,
-    /// the search frame last.
+    /// Filter `(B, d)` and the encoder's outputs `(B, frames * F*F, d)` for tokens of that shape, the
+    /// search frame last.
     pub fn predict_filter(&self, tokens: Tensor<3>, side: usize) -> (Tensor<2>, Tensor<3>) {
         let position = position(side, &tokens);
         let memory = self.filter_predictor.transformer.encode(tokens, position.clone());
-        self.decode(memory, position)
+        let (filter, _) = self.decode(memory.clone(), position);
+        (filter, memory)
     }
 
     /// The encoder's outputs `(B, frames * F*F, d)` for tokens of that shape, the search frame last.

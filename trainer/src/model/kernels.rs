@@ -8,6 +8,10 @@
 //! Inference and graph capture never come here; the same numbers come from `conv2d` there, and
 //! tests compare both ways.
 
+mod depthwise;
+pub(crate) mod mobile;
+mod simd;
+
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
@@ -18,6 +22,7 @@ use burn::backend::{
     Autodiff, Backend, Dispatch, DispatchDevice, Flex, TensorMetadata as _, backend_extension,
 };
 use burn::prelude::*;
+use depthwise::{Limits, depthwise, depthwise_backward};
 use rayon::prelude::*;
 
 /// Shape of a depthwise or unfolding window: kernel side, stride, padding before (behind is what
@@ -217,93 +222,6 @@ fn tensor(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape.to_vec()))
 }
 
-/// Where the values of one plane lie for a windowed operation.
-///
-/// The padded plane is split into `stride * stride` phases (even and odd rows and columns at
-/// stride 2), so that what one tap of the kernel reads for all outputs is a single contiguous run.
-/// Runs are `wide` long per output row; what they hold behind the output's width is ignored.
-struct Plan {
-    side: [usize; 2],
-    out: [usize; 2],
-    /// Columns of a phase.
-    wide: usize,
-    /// Values of a phase.
-    phase: usize,
-    window: Window,
-}
-
-impl Plan {
-    fn new([h, w]: [usize; 2], window: Window) -> Self {
-        let Window { kernel, stride, before } = window;
-        let out = [h.div_ceil(stride), w.div_ceil(stride)];
-        let phase_side = |out: usize, side: usize| {
-            (out + (kernel - 1) / stride).max((side + before).div_ceil(stride))
-        };
-        let wide = phase_side(out[1], w);
-        Self { side: [h, w], out, wide, phase: phase_side(out[0], h) * wide, window }
-    }
-
-    fn plane(&self) -> usize {
-        self.side[0] * self.side[1]
-    }
-
-    fn out_plane(&self) -> usize {
-        self.out[0] * self.out[1]
-    }
-
-    /// A buffer for all phases of a plane.
-    fn phases(&self) -> Vec<f32> {
-        vec![0.0; self.window.stride * self.window.stride * self.phase]
-    }
-
-    /// Length of a run over all output rows.
-    fn run(&self) -> usize {
-        (self.out[0] - 1) * self.wide + self.out[1]
-    }
-
-    /// Taps of the kernel, row-major, and where their runs begin.
-    fn taps(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
-        let Window { kernel, stride, .. } = self.window;
-        (0..kernel * kernel).map(move |tap| (tap, self.index(tap / kernel, tap % kernel, stride)))
-    }
-
-    /// Index of a row and column of the padded plane among the phases.
-    fn index(&self, row: usize, column: usize, stride: usize) -> usize {
-        let phase = (row % stride) * stride + column % stride;
-        phase * self.phase + (row / stride) * self.wide + column / stride
-    }
-
-    /// Writes a plane into its place; the padding around it has to be zero already.
-    fn split(&self, plane: &[f32], phases: &mut [f32]) {
-        let Window { stride, before, .. } = self.window;
-        for (y, row) in plane.chunks_exact(self.side[1]).enumerate() {
-            if stride == 1 {
-                let at = self.index(y + before, before, 1);
-                phases[at..at + row.len()].copy_from_slice(row);
-            } else {
-                for (x, v) in row.iter().enumerate() {
-                    phases[self.index(y + before, x + before, stride)] = *v;
-                }
-            }
-        }
-    }
-
-    /// Reads a plane from its place.
-    fn join(&self, phases: &[f32], plane: &mut [f32]) {
-        let Window { stride, before, .. } = self.window;
-        for (y, row) in plane.chunks_exact_mut(self.side[1]).enumerate() {
-            if stride == 1 {
-                let at = self.index(y + before, before, 1);
-                row.copy_from_slice(&phases[at..at + row.len()]);
-            } else {
-                for (x, v) in row.iter_mut().enumerate() {
-                    *v = phases[self.index(y + before, x + before, stride)];
-                }
-            }
-        }
-    }
-}
-
 impl TrainOps for Flex {
     fn depthwise_relu6(
         x: FlexTensor,
@@ -311,36 +229,7 @@ impl TrainOps for Flex {
         bias: FlexTensor,
         window: Window,
     ) -> FlexTensor {
-        let (x, weight, bias) = (x.to_contiguous(), weight.to_contiguous(), bias.to_contiguous());
-        let [c, n, h, w] = dims(&x);
-        let plan = Plan::new([h, w], window);
-        let (xs, ws, bs) = (x.storage::<f32>(), weight.storage::<f32>(), bias.storage::<f32>());
-        let taps = window.kernel * window.kernel;
-        let mut y = vec![0.0f32; c * n * plan.out_plane()];
-        y.par_chunks_mut(n * plan.out_plane()).enumerate().for_each(|(ch, y)| {
-            let mut phases = plan.phases();
-            let mut sums = vec![0.0; plan.run()];
-            let weight = &ws[ch * taps..(ch + 1) * taps];
-            let images = &xs[ch * n * plan.plane()..(ch + 1) * n * plan.plane()];
-            for (image, y) in
-                images.chunks_exact(plan.plane()).zip(y.chunks_exact_mut(plan.out_plane()))
-            {
-                plan.split(image, &mut phases);
-                sums.fill(bs[ch]);
-                for (tap, from) in plan.taps() {
-                    let weight = weight[tap];
-                    for (s, v) in sums.iter_mut().zip(&phases[from..]) {
-                        *s += weight * v;
-                    }
-                }
-                for (y, row) in y.chunks_exact_mut(plan.out[1]).zip(sums.chunks(plan.wide)) {
-                    for (y, s) in y.iter_mut().zip(row) {
-                        *y = s.clamp(0.0, 6.0);
-                    }
-                }
-            }
-        });
-        tensor(y, &[c, n, plan.out[0], plan.out[1]])
+        depthwise(x, weight, bias, window, Limits::Relu6)
     }
 
     fn unfold_same(x: FlexTensor, window: Window) -> FlexTensor {
@@ -403,58 +292,7 @@ impl TrainGradients for Flex {
         window: Window,
         needs_x: bool,
     ) -> (Option<FlexTensor>, FlexTensor, FlexTensor) {
-        let (x, weight) = (x.to_contiguous(), weight.to_contiguous());
-        let (y, grad) = (y.to_contiguous(), grad.to_contiguous());
-        let [c, n, h, w] = dims(&x);
-        let plan = Plan::new([h, w], window);
-        let (xs, ws) = (x.storage::<f32>(), weight.storage::<f32>());
-        let (ys, gs) = (y.storage::<f32>(), grad.storage::<f32>());
-        let taps = window.kernel * window.kernel;
-        let (plane, out) = (n * plan.plane(), n * plan.out_plane());
-        let mut gx = vec![0.0f32; c * plane];
-        let mut gw = vec![0.0f32; c * taps];
-        let mut gb = vec![0.0f32; c];
-        gx.par_chunks_mut(plane)
-            .zip(gw.par_chunks_mut(taps))
-            .zip(gb.par_iter_mut())
-            .enumerate()
-            .for_each(|(ch, ((gx, gw), gb))| {
-                let mut phases = plan.phases();
-                let mut spread = plan.phases();
-                // The output gradient on the runs' grid, zeros behind every row.
-                let mut g = vec![0.0; plan.run()];
-                let weight = &ws[ch * taps..(ch + 1) * taps];
-                for image in 0..n {
-                    let from = ch * plane + image * plan.plane();
-                    plan.split(&xs[from..from + plan.plane()], &mut phases);
-                    let from = ch * out + image * plan.out_plane();
-                    let rows = ys[from..from + plan.out_plane()].chunks_exact(plan.out[1]);
-                    let rows =
-                        rows.zip(gs[from..from + plan.out_plane()].chunks_exact(plan.out[1]));
-                    for ((y, grad), g) in rows.zip(g.chunks_mut(plan.wide)) {
-                        for ((g, y), grad) in g.iter_mut().zip(y).zip(grad) {
-                            *g = if *y > 0.0 && *y < 6.0 { *grad } else { 0.0 };
-                        }
-                    }
-                    *gb += sum(&g);
-                    for (tap, from) in plan.taps() {
-                        gw[tap] += dot(&g, &phases[from..from + g.len()]);
-                    }
-                    if needs_x {
-                        spread.fill(0.0);
-                        for (tap, from) in plan.taps() {
-                            let weight = weight[tap];
-                            for (s, g) in spread[from..].iter_mut().zip(&g) {
-                                *s += weight * g;
-                            }
-                        }
-                        let gx = &mut gx[image * plan.plane()..(image + 1) * plan.plane()];
-                        plan.join(&spread, gx);
-                    }
-                }
-            });
-        let gx = needs_x.then(|| tensor(gx, &[c, n, h, w]));
-        (gx, tensor(gw, &[c, taps]), tensor(gb, &[c]))
+        depthwise_backward(x, weight, Some(y), grad, window, needs_x)
     }
 
     fn fold_same(columns: FlexTensor, [c, n, h, w]: [usize; 4], window: Window) -> FlexTensor {
@@ -508,16 +346,4 @@ fn sum(values: &[f32]) -> f32 {
         }
     }
     lanes.iter().sum::<f32>() + rest.iter().sum::<f32>()
-}
-
-/// Scalar product in eight lanes.
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
-    let mut lanes = [0.0f32; 8];
-    for (a, b) in a.iter().zip(b) {
-        for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
-            *lane += a * b;
-        }
-    }
-    lanes.iter().sum::<f32>() + a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum::<f32>()
 }

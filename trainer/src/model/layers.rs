@@ -5,10 +5,12 @@
 
 use super::kernels::{self, Window};
 use burn::module::Param;
+use burn::nn::Dropout;
 use burn::prelude::*;
 use burn::tensor::Distribution;
 use burn::tensor::module::conv2d;
 use burn::tensor::ops::ConvOptions;
+use rayon::prelude::*;
 
 /// Zero padding of one spatial axis, `(before, after)`.
 pub(crate) type Pad = (usize, usize);
@@ -30,6 +32,11 @@ impl Geometry {
     /// Padding `kernel / 2` on both sides, as in PyTorch's ResNet.
     pub const fn centred(kernel: usize, stride: usize) -> Self {
         Self { kernel, stride, pad: (kernel / 2, kernel / 2), groups: 1 }
+    }
+
+    /// The same with this many groups.
+    pub const fn grouped(self, groups: usize) -> Self {
+        Self { groups, ..self }
     }
 
     /// TensorFlow "SAME": at stride 2 on even sides the odd pixel of padding goes behind.
@@ -116,6 +123,8 @@ pub(crate) enum Activation {
     Relu,
     /// `min(max(x, 0), 6)`.
     Relu6,
+    /// `x * min(max(x / 6 + 0.5, 0), 1)`.
+    HardSwish,
 }
 
 impl Activation {
@@ -125,6 +134,7 @@ impl Activation {
             Self::Identity => x,
             Self::Relu => burn::tensor::activation::relu(x),
             Self::Relu6 => x.clamp(0.0, 6.0),
+            Self::HardSwish => burn::tensor::activation::hard_swish(x),
         }
     }
 }
@@ -211,6 +221,20 @@ impl WideConv {
     pub fn depthwise_relu6(&self, x: Tensor<4>) -> Tensor<4> {
         kernels::depthwise_relu6(x, self.weight.clone(), self.bias.clone(), self.window)
     }
+
+    /// 1x1 convolution with hard-swish, `(in, N, H, W)` to `(out, N, H, W)`.
+    pub fn pointwise_hard_swish(&self, x: Tensor<4>) -> Tensor<4> {
+        let [inp, n, h, w] = x.dims();
+        let y = self.weight.clone().matmul(x.reshape([inp, n * h * w]));
+        let y = kernels::mobile::bias_hard_swish(y, self.bias.clone());
+        let out = y.dims()[0];
+        y.reshape([out, n, h, w])
+    }
+
+    /// Depthwise convolution without activation, `(C, N, H, W)` to `(C, N, H', W')`.
+    pub fn depthwise(&self, x: Tensor<4>) -> Tensor<4> {
+        kernels::mobile::depthwise(x, self.weight.clone(), self.bias.clone(), self.window)
+    }
 }
 
 /// Weight and bias of the convolution that equals `bn` after `conv`.
@@ -252,6 +276,47 @@ pub(crate) fn instance_l2_norm_wide(x: Tensor<3>, filter_size: usize) -> Tensor<
     x * energy.sqrt().recip().mul_scalar(scale * (count as f64).sqrt())
 }
 
+/// Dropout. Burn draws one number of a cryptographic generator per element; on the CPU that costs more
+/// than the layers around it, so here the device's generator gives a seed and an integer hash of
+/// seed and place decides. As there, nothing happens outside training.
+pub(crate) fn dropout<const D: usize>(layer: &Dropout, x: Tensor<D>) -> Tensor<D> {
+    let device = x.device();
+    if !device.is_autodiff() || !kernels::supports(&device) {
+        return layer.forward(x);
+    }
+    if layer.prob == 0.0 || !layer.training.is_enabled() {
+        return x;
+    }
+    let device = device.inner();
+    let drawn = Tensor::<1>::random([2], Distribution::Uniform(0.0, 1.0), &device).into_data();
+    // 24 random bits each.
+    let seed: [u32; 2] =
+        std::array::from_fn(|i| drawn.iter::<f32>().nth(i).unwrap_or_default().to_bits());
+    let mask = dropout_mask(seed, layer.prob, x.shape().num_elements());
+    let mask = Tensor::<D>::from_data(TensorData::new(mask, x.shape()), &device);
+    x * Tensor::from_inner(mask)
+}
+
+/// 0 with probability `drop`, else `1 / (1 - drop)`.
+fn dropout_mask(seed: [u32; 2], drop: f64, count: usize) -> Vec<f32> {
+    const CHUNK: usize = 1 << 14;
+    let (kept, limit) = ((1.0 / (1.0 - drop)) as f32, (drop * f64::from(u32::MAX)) as u32);
+    let mut mask = vec![0.0f32; count];
+    mask.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, mask)| {
+        let first = (chunk * CHUNK) as u32;
+        for (i, mask) in mask.iter_mut().enumerate() {
+            // A Weyl sequence through murmur3's finaliser.
+            let place = first.wrapping_add(i as u32).wrapping_mul(0x9e37_79b9);
+            let mut h = place.wrapping_add(seed[0]) ^ seed[1].rotate_left(9);
+            h = (h ^ (h >> 16)).wrapping_mul(0x85eb_ca6b);
+            h = (h ^ (h >> 13)).wrapping_mul(0xc2b2_ae35);
+            h ^= h >> 16;
+            *mask = if h < limit { 0.0 } else { kept };
+        }
+    });
+    mask
+}
+
 /// The fixed positional code of one frame, `(side * side, width)` row-major (spec 1.5, with the
 /// map's side as `maxres`).
 pub(crate) fn positional_code(side: usize, width: usize) -> Vec<f32> {
@@ -271,4 +336,45 @@ pub(crate) fn positional_code(side: usize, width: usize) -> Vec<f32> {
         }
     }
     code
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::nn::DropoutConfig;
+
+    #[test]
+    fn dropout_keeps_the_mean_and_follows_the_seed() {
+        let device = Device::flex().autodiff();
+        let layer = DropoutConfig::new(0.3).init();
+        let run = |seed: u64| {
+            device.seed(seed);
+            // Twice: the second call must not repeat the first.
+            [(); 2].map(|()| {
+                let x = Tensor::<2>::ones([200, 500], &device).require_grad();
+                let y = dropout(&layer, x.clone());
+                let gradients = y.clone().sum().backward();
+                let gradient = x.grad(&gradients).map(|g| g.into_data());
+                assert_eq!(gradient, Some(y.clone().inner().into_data()), "the mask, here");
+                y.into_data().try_to_vec::<f32>().unwrap()
+            })
+        };
+        let first = run(5);
+        assert_eq!(first, run(5));
+        assert_ne!(first[0], first[1]);
+        assert_ne!(first[0], run(6)[0]);
+        for mask in &first {
+            let dropped = mask.iter().filter(|v| **v == 0.0).count() as f64 / 1e5;
+            assert!((dropped - 0.3).abs() < 0.006, "{dropped}");
+            assert!(mask.iter().all(|v| *v == 0.0 || (v - 1.0 / 0.7).abs() < 1e-6));
+            // No stripes: neighbours in a row and in a column are independent.
+            for apart in [1, 500] {
+                let pairs = mask.iter().zip(&mask[apart..]);
+                let both = pairs.filter(|(a, b)| **a == 0.0 && **b == 0.0).count() as f64 / 1e5;
+                assert!((both - 0.09).abs() < 0.005, "{both} at {apart}");
+            }
+        }
+        let plain = Tensor::<2>::ones([2, 2], &Device::flex());
+        assert_eq!(dropout(&layer, plain.clone()).into_data(), plain.into_data());
+    }
 }

@@ -22,10 +22,9 @@
 //!
 //! # Speed
 //! On the CPU, training takes another road than inference through the convolutions: batch-wide maps
-//! and the operations of `kernels`. Numbers and gradients are the same (tested). The nano network at
-//! crop 160 with batch 16 (two templates each) takes 1.6 CPU seconds per step, 1.8 with dropout on
-//! attention weights too; the allocator's returning of large buffers to the system costs up to 15 %
-//! more, which `MALLOC_MMAP_THRESHOLD_` and `MALLOC_TRIM_THRESHOLD_` (glibc) avoid.
+//! and the operations of `kernels`. Numbers and gradients are the same (tested);
+//! `cargo bench -p tsda-trainer --bench throughput` measures a step, and
+//! `scripts/torch_throughput.py` the same network in PyTorch (figures: docs/training.md).
 //!
 //! Frozen layers ([`FreezePolicy`]) run outside autodiff and keep no graph. Batch norms of the
 //! backbone never update their statistics; they are folded into the convolutions before them in
@@ -37,6 +36,7 @@ mod head;
 pub mod inspect;
 mod kernels;
 mod layers;
+mod mobilenet;
 mod names;
 mod pooled;
 mod resnet;
@@ -50,6 +50,7 @@ pub use names::{Layout, state_dict_name};
 use backbone::BackboneNet;
 use burn::prelude::*;
 use head::Head;
+pub(crate) use transformer::linear_layer;
 use tsda_runtime::{ModelSpec, SpecError};
 
 /// Settings of a net that matter only in training.
@@ -117,6 +118,9 @@ pub struct TrainOutput {
     pub template_features: Tensor<5>,
     /// Head features of the search frames before any encoding, `(B, d, F, F)`.
     pub search_features: Tensor<4>,
+    /// The encoder's outputs, `(B, (T + 1) * F*F, d)`: the templates frame by frame, then the search
+    /// frame.
+    pub memory: Tensor<3>,
 }
 
 impl TrackerNet {
@@ -234,13 +238,14 @@ impl TrackerNet {
             .template_tokens(template_features.clone(), labels, ltrb)
             .reshape([b, t * f * f, d]);
         let search = self.head.search_tokens(search_features.clone());
-        let (filter, encoded) =
-            self.head.predict_filter(Tensor::cat(vec![templates, search], 1), f);
+        let (filter, memory) = self.head.predict_filter(Tensor::cat(vec![templates, search], 1), f);
+        let encoded = memory.clone().narrow(1, t * f * f, f * f);
         TrainOutput {
             scores: self.head.scores(filter.clone(), encoded.clone(), f),
             ltrb: self.head.ltrb(filter, encoded, f),
             template_features: template_features.reshape([b, t, d, f, f]),
             search_features,
+            memory,
         }
     }
 

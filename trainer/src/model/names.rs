@@ -1,5 +1,7 @@
 //! Names and layouts of parameters in files: PyTorch's state dict (spec 1.9).
 
+use super::mobilenet;
+
 /// How a parameter is laid out in a file, compared with burn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layout {
@@ -31,6 +33,15 @@ impl Layout {
 /// `head.filter_predictor.box_encoding.conv3.weight` becomes
 /// `head.filter_predictor.box_encoding.3.weight`, stored as `(out, in, 1)`.
 pub fn state_dict_name(path: &[String]) -> (String, Layout) {
+    if let [extractor, variant, layers @ .., parameter] = path
+        && variant == "MobileNet"
+        && let Some(layer) = mobilenet::published_name(layers)
+    {
+        // Of its layers, only those of a gate are linear.
+        let gate = parameter == "weight" && layers.iter().any(|l| l == "gate");
+        let layout = if gate { Layout::Linear } else { Layout::Same };
+        return (format!("{extractor}.{layer}.{parameter}"), layout);
+    }
     let mut name: Vec<String> = Vec::with_capacity(path.len());
     let mut layout = Layout::Same;
     let efficientnet = path.get(1).is_some_and(|p| p == "EfficientNet");

@@ -1,6 +1,7 @@
 //! The network against the reference (golden vectors) and against itself.
 
 mod as_written;
+mod mobilenet;
 mod rearrangements;
 
 use super::*;
@@ -301,8 +302,8 @@ fn intermediate_figures_equal_the_reference() {
     let input = &case.get("inter.encoder.input").unwrap().values;
     let row: Vec<f32> = input.chunks(2 * d).flat_map(|both| &both[..d]).copied().collect();
     assert!(difference(&values(tokens.clone()), &row) <= 1e-5);
-    let (filter, encoded) = net.head.predict_filter(tokens, f);
-    let encoded = encoded.swap_dims(1, 2).reshape([1, d, f, f]);
+    let (filter, memory) = net.head.predict_filter(tokens, f);
+    let encoded = memory.narrow(1, 2 * f * f, f * f).swap_dims(1, 2).reshape([1, d, f, f]);
     close("cls_enc", values(encoded), 2e-5);
     // `cls_filter` is the filter before the classifier's projection.
     close("cls_filter", values(filter), 2e-5);

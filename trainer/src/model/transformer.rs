@@ -3,7 +3,7 @@
 
 mod inspect;
 
-use super::layers::{filled, uniform};
+use super::layers::{dropout, filled, uniform};
 use burn::module::Param;
 use burn::nn::{Dropout, DropoutConfig, LayerNorm, LayerNormConfig, Linear, LinearConfig};
 use burn::prelude::*;
@@ -109,7 +109,7 @@ impl Attention {
             part.reshape([b, l, self.heads, depth]).swap_dims(1, 2)
         };
         let logits = part(0).matmul(part(d).swap_dims(2, 3));
-        let weights = self.dropout.forward(softmax(logits, 3));
+        let weights = dropout(&self.dropout, softmax(logits, 3));
         let mixed = weights.matmul(part(2 * d)).swap_dims(1, 2).reshape([b, l, d]);
         self.out_proj.forward(mixed)
     }
@@ -145,7 +145,7 @@ impl Attention {
         // one number to all logits of a head and cancels in the softmax.
         let q = q.matmul(per_head(d)).swap_dims(0, 1);
         let logits = q.matmul(memory.keys.clone());
-        let weights = self.dropout.forward(softmax(logits, 2));
+        let weights = dropout(&self.dropout, softmax(logits, 2));
         let context = weights.clone().matmul(memory.tokens.clone()).swap_dims(0, 1);
         let values = context.matmul(per_head(2 * d).swap_dims(1, 2)).swap_dims(0, 1);
         let bias = self.in_proj_bias.val().narrow(0, 2 * d, d).reshape([1, heads, depth]);
@@ -187,10 +187,10 @@ impl EncoderLayer {
 
     /// [`Self::forward`] where the projections of the tokens, `(B, L, 3d)`, are known.
     fn forward_projected(&self, x: Tensor<3>, projected: Tensor<3>) -> Tensor<3> {
-        let a = self.dropout.forward(self.self_attn.attend(projected));
+        let a = dropout(&self.dropout, self.self_attn.attend(projected));
         let x = self.norm1.forward(x + a);
-        let h = self.dropout.forward(relu(self.linear1.forward(x.clone())));
-        let f = self.dropout.forward(self.linear2.forward(h));
+        let h = dropout(&self.dropout, relu(self.linear1.forward(x.clone())));
+        let f = dropout(&self.dropout, self.linear2.forward(h));
         self.norm2.forward(x + f)
     }
 }
@@ -229,19 +229,19 @@ impl DecoderLayer {
         let t = match token {
             Some(t) => {
                 let a = self.self_attn.single_self_attention(t.clone());
-                t + self.dropout.forward(a)
+                t + dropout(&self.dropout, a)
             }
             None => {
                 let a = self.self_attn.zero_self_attention();
                 let a = if b > 1 { a.repeat_dim(0, b) } else { a };
-                self.dropout.forward(a)
+                dropout(&self.dropout, a)
             }
         };
         let t = self.norm1.forward(t);
         let a = self.multihead_attn.cross_attention(t.clone() + query, memory);
-        let t = self.norm2.forward(t + self.dropout.forward(a));
-        let h = self.dropout.forward(relu(self.linear1.forward(t.clone())));
-        let f = self.dropout.forward(self.linear2.forward(h));
+        let t = self.norm2.forward(t + dropout(&self.dropout, a));
+        let h = dropout(&self.dropout, relu(self.linear1.forward(t.clone())));
+        let f = dropout(&self.dropout, self.linear2.forward(h));
         self.norm3.forward(t + f)
     }
 }

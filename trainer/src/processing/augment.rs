@@ -4,6 +4,16 @@ use crate::config::PhotometricConfig;
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 
+/// Weights of R, G, B in the luma of BT.601.
+pub(super) const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
+
+/// A random mixture of R, G, B: weights from 0 to 1 that add up to 1.
+pub(super) fn channel_mix(rng: &mut impl Rng) -> [f32; 3] {
+    let weights: [f32; 3] = std::array::from_fn(|_| rng.random::<f32>() + 1e-3);
+    let sum: f32 = weights.iter().sum();
+    weights.map(|weight| weight / sum)
+}
+
 /// Pixels of a square crop: 8-bit, interleaved, 1 or 3 channels.
 pub(super) struct Pixels {
     pub side: usize,
@@ -12,16 +22,48 @@ pub(super) struct Pixels {
 }
 
 impl Pixels {
-    /// Luma (BT.601) as the only channel; nothing happens to a grey crop.
-    pub fn into_grey(self) -> Self {
+    /// One channel: R, G and B times `weights`, added up ([`LUMA`], or another mixture); nothing
+    /// happens to a grey crop.
+    pub fn into_grey(self, weights: [f32; 3]) -> Self {
         if self.channels != 3 {
             return self;
         }
-        let luma = |p: &[u8]| {
-            let v = 0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2]);
-            v.round_ties_even() as u8
+        let mix = |p: &[u8]| {
+            let v: f32 = p.iter().zip(weights).map(|(v, weight)| f32::from(*v) * weight).sum();
+            v.clamp(0.0, 255.0).round_ties_even() as u8
         };
-        Self { side: self.side, channels: 1, data: self.data.chunks_exact(3).map(luma).collect() }
+        Self { side: self.side, channels: 1, data: self.data.chunks_exact(3).map(mix).collect() }
+    }
+
+    /// Stretches the grey values so that some share of the pixels, at most `window` at either end, is
+    /// clipped: what automatic gain does in a thermal camera.
+    pub fn window(&mut self, config: &PhotometricConfig, rng: &mut impl Rng) {
+        if config.window_p <= 0.0 || !rng.random_bool(config.window_p) {
+            return;
+        }
+        let mut histogram = [0usize; 256];
+        self.data.iter().for_each(|v| histogram[usize::from(*v)] += 1);
+        let n = self.data.len() as f32;
+        let (below, above) = (rng.random::<f32>(), rng.random::<f32>());
+        // First grey value that leaves at most this share of pixels behind it.
+        let reach = |share: f32, from_top: bool| {
+            let mut left = share * config.window * n;
+            (0..256).map(|v| if from_top { 255 - v } else { v }).find(|&v| {
+                left -= histogram[v] as f32;
+                left < 0.0
+            })
+        };
+        let (low, high) = (reach(below, false), reach(above, true));
+        // A flat crop has nothing to stretch.
+        let (Some(low), Some(high)) = (low, high) else { return };
+        if high < low + 8 {
+            return;
+        }
+        let scale = 255.0 / (high - low) as f32;
+        for v in &mut self.data {
+            let value = (f32::from(*v) - low as f32) * scale;
+            *v = value.clamp(0.0, 255.0).round_ties_even() as u8;
+        }
     }
 
     /// Planar float copy in 0..255, `channels` planes.
@@ -69,6 +111,13 @@ pub(super) fn degrade(
     let (blur, sigma) = (rng.random_bool(config.blur_p), config.blur_sigma * rng.random::<f32>());
     let (noise, level) =
         (rng.random_bool(config.noise_p), config.noise_sigma * rng.random::<f32>());
+    if config.motion_blur_p > 0.0 && rng.random_bool(config.motion_blur_p) {
+        let length = config.motion_blur * rng.random::<f32>();
+        let angle = std::f32::consts::PI * rng.random::<f32>();
+        for plane in planes.chunks_exact_mut(side * side) {
+            motion_blur(plane, side, length, angle);
+        }
+    }
     if blur && sigma > 0.1 {
         for plane in planes.chunks_exact_mut(side * side) {
             gaussian_blur(plane, side, sigma);
@@ -79,6 +128,28 @@ pub(super) fn degrade(
             let n: f32 = StandardNormal.sample(rng);
             *v += level * n;
         }
+    }
+}
+
+/// Mean along a line of `length` pixels in direction `angle`, centred, so that nothing moves on
+/// average and boxes stay right; borders replicated.
+fn motion_blur(plane: &mut [f32], side: usize, length: f32, angle: f32) {
+    let reach = (length * 0.5).round() as i32;
+    if reach < 1 {
+        return;
+    }
+    let (dy, dx) = angle.sin_cos();
+    let taps: Vec<(i32, i32)> = (-reach..=reach)
+        .map(|t| ((dx * t as f32).round() as i32, (dy * t as f32).round() as i32))
+        .collect();
+    let before = plane.to_vec();
+    let last = side as i32 - 1;
+    for (i, out) in plane.iter_mut().enumerate() {
+        let (x, y) = ((i % side) as i32, (i / side) as i32);
+        let at = |(dx, dy): &(i32, i32)| {
+            before[(y + dy).clamp(0, last) as usize * side + (x + dx).clamp(0, last) as usize]
+        };
+        *out = taps.iter().map(at).sum::<f32>() / taps.len() as f32;
     }
 }
 
@@ -175,8 +246,53 @@ mod tests {
     }
 
     #[test]
+    fn motion_blur_moves_nothing_on_average() {
+        for step in 0..12 {
+            let mut spot = vec![0.0; 31 * 31];
+            spot[15 * 31 + 15] = 100.0;
+            motion_blur(&mut spot, 31, 9.0, step as f32 * 0.26);
+            let centre = |f: &dyn Fn(usize) -> usize| {
+                spot.iter().enumerate().map(|(i, v)| f(i) as f32 * v).sum::<f32>() / 100.0
+            };
+            assert!((spot.iter().sum::<f32>() - 100.0).abs() < 1e-3);
+            assert!((centre(&|i| i % 31) - 15.0).abs() < 1e-3, "step {step}");
+            assert!((centre(&|i| i / 31) - 15.0).abs() < 1e-3, "step {step}");
+            assert!(spot[15 * 31 + 15] < 15.0);
+        }
+    }
+
+    #[test]
+    fn windows_fill_the_range_and_keep_the_order() {
+        let config = PhotometricConfig { window_p: 1.0, window: 0.1, ..Default::default() };
+        for seed in 0..20 {
+            let mut p = Pixels {
+                side: 16,
+                channels: 1,
+                data: (0..256).map(|i| 60 + i as u8 / 4).collect::<Vec<_>>(),
+            };
+            p.window(&config, &mut ChaCha8Rng::seed_from_u64(seed));
+            assert!(p.data.windows(2).all(|w| w[0] <= w[1]));
+            assert_eq!((p.data[0], p.data[255]), (0, 255));
+            let clipped = p.data.iter().filter(|v| **v == 0).count();
+            assert!(clipped <= 30, "{clipped} of 256");
+        }
+        let mut flat = Pixels { side: 4, channels: 1, data: vec![90; 16] };
+        flat.window(&config, &mut ChaCha8Rng::seed_from_u64(1));
+        assert_eq!(flat.data, [90; 16]);
+    }
+
+    #[test]
+    fn channel_mixtures_add_up_and_differ() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let (a, b) = (channel_mix(&mut rng), channel_mix(&mut rng));
+        assert!((a.iter().sum::<f32>() - 1.0).abs() < 1e-6 && a != b);
+        let p = Pixels { side: 1, channels: 3, data: vec![200, 200, 200] }.into_grey(a);
+        assert_eq!((p.channels, p.data), (1, vec![200]));
+    }
+
+    #[test]
     fn grey_is_the_luma() {
-        let p = Pixels { side: 1, channels: 3, data: vec![200, 100, 50] }.into_grey();
+        let p = Pixels { side: 1, channels: 3, data: vec![200, 100, 50] }.into_grey(LUMA);
         assert_eq!((p.channels, p.data), (1, vec![124]));
     }
 }

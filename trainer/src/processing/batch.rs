@@ -16,6 +16,8 @@ pub struct Batch {
     pub ids: Vec<String>,
     /// Which samples cross sensors, `(B)`.
     pub cross: Vec<bool>,
+    /// Which samples have thermal templates, `(B)`.
+    pub thermal: Vec<bool>,
     /// `(B*T, 3, S, S)`, sample by sample.
     pub template_crops: Vec<f32>,
     /// `(B*T, F, F)` Gaussian labels.
@@ -43,6 +45,7 @@ impl Batch {
             templates,
             ids: samples.iter().map(|s| s.id.clone()).collect(),
             cross: samples.iter().map(|s| s.cross).collect(),
+            thermal: samples.iter().map(Sample::is_thermal).collect(),
             template_crops: Vec::with_capacity(samples.len() * templates * spec.crop_len()),
             template_labels: Vec::new(),
             template_ltrb: Vec::new(),

@@ -1,8 +1,8 @@
 //! From drawn frames to network input (spec 2.2 to 2.4).
 //!
-//! Order, for one sample: one draw for all frames (grey, whole-picture mirror, thermal polarity);
-//! then for every crop on its own: jitter, cut, tone curve, blur and noise, brightness, mirror,
-//! normalisation. Labels are made from the box in crop pixels.
+//! Order, for one sample: one draw for all frames (grey or channel mixture, whole-picture mirror,
+//! polarity); then for every crop on its own: jitter, cut, (search crop) distractor and occluder,
+//! window, tone curve, smear, blur and noise, brightness, mirror, normalisation. Labels are made from the box in crop pixels.
 //!
 //! Everything random of a sample comes from one ChaCha8 stream keyed by `(seed, index)`
 //! ([`sample_rng`]), so a batch depends on nothing but the seed and its step.
@@ -10,6 +10,7 @@
 mod augment;
 mod batch;
 mod crop;
+mod paste;
 mod sheet;
 
 pub use batch::{Batch, BatchMaker};
@@ -46,6 +47,13 @@ pub struct Sample {
     pub search: Crop,
     /// Does the search crop come from another sensor?
     pub cross: bool,
+}
+
+impl Sample {
+    /// Are the templates thermal?
+    pub fn is_thermal(&self) -> bool {
+        self.templates.first().is_some_and(|t| t.modality == Modality::Thermal)
+    }
 }
 
 /// The random stream of one sample.
@@ -87,10 +95,17 @@ fn flip_box(bbox: &BBox, width: usize) -> BBox {
 
 /// What one draw decides for the whole sample.
 struct Joint {
-    grey: bool,
+    /// Weights of R, G, B where RGB pictures turn into one channel.
+    grey: Option<[f32; 3]>,
     mirror: bool,
     invert_rgb: bool,
     invert_thermal: bool,
+}
+
+/// What is pasted into a search crop.
+struct Others<'a> {
+    distractor: Option<&'a DrawnFrame>,
+    occluder: Option<&'a DrawnFrame>,
 }
 
 /// Turns drawn frames into crops.
@@ -117,15 +132,25 @@ impl Processor {
     pub fn process(&self, drawn: &Drawn, rng: &mut impl Rng) -> Sample {
         let config = &self.config;
         let mut chance = |p: f64| rng.random_bool(p) && self.augment;
-        let joint = Joint {
-            grey: chance(config.grayscale_p),
+        let mut joint = Joint {
+            grey: chance(config.grayscale_p).then_some(augment::LUMA),
             mirror: chance(config.joint_flip_p),
             invert_rgb: chance(config.rgb.invert_p),
             invert_thermal: chance(config.thermal.invert_p),
         };
-        let templates =
-            drawn.templates.iter().map(|f| self.crop(f, &config.template, &joint, rng)).collect();
-        let search = self.crop(&drawn.search, &config.search, &joint, rng);
+        if self.augment && config.channel_mix_p > 0.0 && rng.random_bool(config.channel_mix_p) {
+            joint.grey = Some(augment::channel_mix(rng));
+        }
+        let nothing = Others { distractor: None, occluder: None };
+        let templates = drawn
+            .templates
+            .iter()
+            .map(|f| self.crop(f, &config.template, &joint, &nothing, rng))
+            .collect();
+        let others =
+            Others { distractor: drawn.distractor.as_ref(), occluder: drawn.occluder.as_ref() };
+        let others = if self.augment { others } else { nothing };
+        let search = self.crop(&drawn.search, &config.search, &joint, &others, rng);
         Sample { id: drawn.id.clone(), templates, search, cross: drawn.is_cross() }
     }
 
@@ -134,6 +159,7 @@ impl Processor {
         frame: &DrawnFrame,
         jitter: &JitterConfig,
         joint: &Joint,
+        others: &Others<'_>,
         rng: &mut impl Rng,
     ) -> Crop {
         let (config, side) = (&self.config, self.spec.crop_side());
@@ -154,12 +180,19 @@ impl Processor {
             channels: picture.channels,
             data: window.cut(picture, side, joint.mirror),
         };
-        if joint.grey {
-            pixels = pixels.into_grey();
+        if let Some(other) = others.distractor {
+            paste::distractor(&mut pixels, &bbox, other, rng);
+        }
+        if let Some(other) = others.occluder {
+            paste::occluder(&mut pixels, &bbox, &other.picture, config.occluder_side, rng);
+        }
+        if let Some(weights) = joint.grey {
+            pixels = pixels.into_grey(weights);
         }
         let mut mirror = false;
         let planes = if self.augment {
             let (photometric, invert) = self.photometric(frame.at.modality, joint);
+            pixels.window(photometric, rng);
             pixels.tone(photometric, invert, rng);
             let mut planes = pixels.planes();
             augment::degrade(&mut planes, side, photometric, rng);

@@ -1,28 +1,35 @@
-//! Draws training samples: which sequence, target, frames and sensors (spec 2.1).
+//! Draws training samples: which source, sequence, target, frames and sensors (spec 2.1).
 //!
-//! The paper's modality rule: all templates of a sample come from one sensor, drawn uniformly; the
-//! search frame comes from the other one with probability `cross_modal_p`. Videos are sampled
-//! causally with a gap; of a still the same picture is used for every crop, and processing moves
-//! the crops independently. A share of the samples of registered pairs takes a random textured
-//! region as target.
+//! First it is drawn whether the sample crosses sensors, then the source by weight ([`mix`] keeps
+//! both the weights and the cross-modal share), then a sequence of it uniformly. The paper's
+//! modality rule: all templates of a sample come from one sensor, drawn uniformly among those the
+//! sequence has; the search frame comes from the same one or from the other. Every sensor's own box
+//! is used. Videos are sampled causally with a gap; of a still the same picture is used for every
+//! crop, and processing moves the crops independently. A share of the samples takes a random
+//! textured region of one frame as target, where a source says that its sensors share a grid.
 
+mod causal;
+mod mix;
 mod pictures;
 mod region;
+mod source;
 
 pub use pictures::{FrameRef, PictureCache};
 
-use crate::config::{DataKind, DataSource, SamplerConfig};
+use crate::config::{DataSource, SamplerConfig};
+use causal::draw_causal;
+use mix::Mix;
 use rand::{Rng, RngExt};
+use source::{Source, Target};
+use std::path::PathBuf;
 use std::sync::Arc;
-use tsda_eval::dataset::{
-    DatasetError, Picture, Sequence, Split, UnknownSplit,
-    pairs::PairsDataset,
-    sequences::{SequenceFilter, SequencesDataset},
-};
+use tsda_eval::dataset::{DatasetError, OpenError, Picture, Sequence};
 use tsda_runtime::{BBox, Modality};
 
-/// Sequences redrawn before a draw is given up.
-const TRIES: usize = 100;
+/// Sources drawn for one sample before the draw is given up.
+const TRIES: usize = 10;
+/// Sequences of a source drawn before another source is.
+const SEQUENCE_TRIES: usize = 20;
 /// Frames a video needs at least.
 const MIN_FRAMES: usize = 20;
 
@@ -30,37 +37,73 @@ const MIN_FRAMES: usize = 20;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SampleError {
-    /// A dataset could not be read.
+    /// A picture could not be read.
     #[error(transparent)]
     Dataset(#[from] DatasetError),
+    /// A source could not be opened.
+    #[error("{place}: {source}")]
+    Open {
+        /// Entry of the configuration.
+        place: String,
+        /// What is wrong.
+        source: Box<OpenError>,
+    },
+    /// A path that is not text.
+    #[error("{place}: path {path} is not valid UTF-8; rename the folder")]
+    Path {
+        /// Entry of the configuration.
+        place: String,
+        /// The folder.
+        path: PathBuf,
+    },
     /// A source has nothing to draw from.
     #[error(
-        "{path}, split '{split}': no sequence can be used (a still needs a box or \
-         sampler.random_region_p > 0, a clip at least {MIN_FRAMES} frames and a target seen in \
-         more than {visible} of them)"
+        "{place}: {path}, split '{split}'{}: none of its {found} sequences can be used (a still \
+         needs a box of at least sampler.min_target, a clip at least {MIN_FRAMES} frames and a \
+         target seen in more than {visible} of them; registered material also does with regions = \
+         true and sampler.random_region_p > 0)", only_text(.only)
     )]
     Empty {
+        /// Entry of the configuration.
+        place: String,
         /// Folder of the source.
-        path: std::path::PathBuf,
+        path: PathBuf,
         /// The split asked for.
         split: String,
+        /// Sequences in the split.
+        found: usize,
+        /// Texts of which sequence names must contain one.
+        only: Vec<String>,
         /// Visible frames needed.
         visible: usize,
     },
-    /// An unknown split name.
-    #[error("{path}: {reason}")]
-    Split {
-        /// Folder of the source.
-        path: std::path::PathBuf,
-        /// What is wrong.
-        reason: String,
+    /// Samples across sensors are asked for and no source can give any.
+    #[error(
+        "sampler.cross_modal_p = {p}, but no target in [[data]] is seen by both sensors ({labels}); \
+         add registered RGB-thermal material, or set it to 0 to train within sensors only"
+    )]
+    NothingCrosses {
+        /// Share asked for.
+        p: f64,
+        /// The sources.
+        labels: String,
     },
     /// No sample could be drawn.
-    #[error("no sample could be drawn in {TRIES} tries; last sequence looked at: {last}")]
+    #[error(
+        "no sample {} sensors could be drawn in {} tries; last sequence looked at: {last}",
+        if *.cross { "across" } else { "within" },
+        TRIES * SEQUENCE_TRIES
+    )]
     NoSample {
+        /// Was it to cross sensors?
+        cross: bool,
         /// Name of the last sequence tried.
         last: String,
     },
+}
+
+fn only_text(only: &[String]) -> String {
+    if only.is_empty() { String::new() } else { format!(", only {only:?}") }
 }
 
 /// A frame and the target's box in it, in picture pixels.
@@ -77,7 +120,7 @@ pub struct DrawnFrame {
 /// One sample before processing.
 #[derive(Clone, Debug)]
 pub struct Drawn {
-    /// Name for logs: sequence, target or region, frames, sensors.
+    /// Name for logs: source, sequence, target or region, frames, sensors.
     pub id: String,
     /// Template frames, all of one sensor.
     pub templates: Vec<DrawnFrame>,
@@ -85,6 +128,11 @@ pub struct Drawn {
     pub search: DrawnFrame,
     /// Is the target a random region?
     pub region: bool,
+    /// Target of another sequence, to be pasted beside this one; of the search frame's sensor.
+    pub distractor: Option<DrawnFrame>,
+    /// Frame of another sequence, part of which is to cover part of the target; of the search
+    /// frame's sensor.
+    pub occluder: Option<DrawnFrame>,
 }
 
 impl Drawn {
@@ -94,21 +142,24 @@ impl Drawn {
     }
 }
 
-struct Source {
-    sequences: Vec<Box<dyn Sequence>>,
-    /// Both sensors see the target at the same place.
-    registered: bool,
-    weight: f64,
-    /// Usable sequences with their usable targets (none: for random regions only).
-    usable: Vec<(usize, Vec<usize>)>,
-    /// Positions in `usable` that have targets.
-    with_targets: Vec<usize>,
+/// What a source gives to the stream of samples.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SourceShare {
+    /// Its name.
+    pub label: String,
+    /// Sequences that can be drawn.
+    pub sequences: usize,
+    /// Its share of all samples, those within one sensor.
+    pub same: f64,
+    /// Its share of all samples, those across sensors.
+    pub cross: f64,
 }
 
 /// Draws samples from all sources of a configuration.
 pub struct Sampler {
     config: SamplerConfig,
     sources: Vec<Source>,
+    mix: Mix,
     cache: Arc<PictureCache>,
 }
 
@@ -117,7 +168,8 @@ impl Sampler {
     /// source that has one.
     ///
     /// # Errors
-    /// When a source cannot be read or has nothing to draw from.
+    /// When a source cannot be read or has nothing to draw from, and (in training) when samples
+    /// across sensors are asked for and none can give them.
     pub fn open(
         sources: &[DataSource],
         config: &SamplerConfig,
@@ -125,44 +177,44 @@ impl Sampler {
         validation: bool,
     ) -> Result<Self, SampleError> {
         let mut opened = Vec::new();
-        for source in sources {
-            let name = if validation { &source.validation_split } else { &source.split };
-            if validation && name.is_empty() {
-                continue;
+        for (i, source) in sources.iter().enumerate() {
+            let split = if validation { &source.validation_split } else { &source.split };
+            if !(validation && split.is_empty()) {
+                opened.push(Source::open(i, source, split, config)?);
             }
-            let split: Split = name.parse().map_err(|e: UnknownSplit| SampleError::Split {
-                path: source.path.clone(),
-                reason: e.to_string(),
-            })?;
-            let sequences: Vec<Box<dyn Sequence>> = match source.kind {
-                DataKind::Pairs => boxed(PairsDataset::open(&source.path, split)?.into_pairs()),
-                DataKind::Sequences => {
-                    let filter = SequenceFilter { split, ..SequenceFilter::default() };
-                    boxed(SequencesDataset::open(&source.path, &filter)?.into_sequences())
-                }
-            };
-            let registered = source.kind == DataKind::Pairs;
-            opened.push(Source::new(sequences, registered, source.weight, config).ok_or_else(
-                || SampleError::Empty {
-                    path: source.path.clone(),
-                    split: name.clone(),
-                    visible: least_visible(config),
-                },
-            )?);
         }
-        Ok(Self { config: config.clone(), sources: opened, cache })
+        if !validation && config.cross_modal_p > 0.0 && !opened.iter().any(Source::can_cross) {
+            let labels: Vec<&str> = opened.iter().map(|s| s.label.as_str()).collect();
+            let (p, labels) = (config.cross_modal_p, labels.join(", "));
+            return Err(SampleError::NothingCrosses { p, labels });
+        }
+        let mut sampler = Self::from_sources(opened, config, cache);
+        if validation {
+            (sampler.config.distractor_p, sampler.config.occluder_p) = (0.0, 0.0);
+        }
+        Ok(sampler)
     }
 
-    /// Sampler over sequences that are already open; for tests and other loaders. `None` when none
-    /// of them can be used.
+    /// Sampler over sequences that are already open; `registered` allows random regions. `None`
+    /// when none of them can be used. Where none has both sensors, nothing crosses.
     pub fn from_sequences(
         sequences: Vec<Box<dyn Sequence>>,
         registered: bool,
         config: &SamplerConfig,
         cache: Arc<PictureCache>,
     ) -> Option<Self> {
-        let source = Source::new(sequences, registered, 1.0, config)?;
-        Some(Self { config: config.clone(), sources: vec![source], cache })
+        let source = Source::new("sequences", sequences, 1.0, registered, config)?;
+        Some(Self::from_sources(vec![source], config, cache))
+    }
+
+    fn from_sources(
+        sources: Vec<Source>,
+        config: &SamplerConfig,
+        cache: Arc<PictureCache>,
+    ) -> Self {
+        let weights: Vec<_> = sources.iter().map(|s| (s.weight, s.can_cross())).collect();
+        let mix = Mix::new(&weights, config.cross_modal_p);
+        Self { config: config.clone(), sources, mix, cache }
     }
 
     /// Is there anything to draw from?
@@ -172,7 +224,17 @@ impl Sampler {
 
     /// Usable sequences over all sources.
     pub fn sequences(&self) -> usize {
-        self.sources.iter().map(|s| s.usable.len()).sum()
+        self.sources.iter().map(|s| s.entries.len()).sum()
+    }
+
+    /// What each source gives, in the order of the configuration.
+    pub fn shares(&self) -> Vec<SourceShare> {
+        let one = |(i, source): (usize, &Source)| {
+            let [same, cross] = self.mix.share(i);
+            let (label, sequences) = (source.label.clone(), source.entries.len());
+            SourceShare { label, sequences, same, cross }
+        };
+        self.sources.iter().enumerate().map(one).collect()
     }
 
     /// Draws one sample; depends on the state of `rng` alone.
@@ -180,62 +242,90 @@ impl Sampler {
     /// # Errors
     /// When a picture cannot be read or nothing suitable is found.
     pub fn draw(&self, rng: &mut impl Rng) -> Result<Drawn, SampleError> {
-        let mut last = String::from("none");
+        let mut last = "none";
+        // Drawn once: redrawing it after a failure would favour what is easy to find.
+        let cross = self.mix.draw_cross(rng);
         for _ in 0..TRIES {
-            let Some(index) = self.draw_source(rng) else { break };
-            let source = &self.sources[index];
-            let region = source.registered && rng.random_bool(self.config.random_region_p);
-            let place = if region || source.with_targets.is_empty() {
-                rng.random_range(0..source.usable.len())
-            } else {
-                source.with_targets[rng.random_range(0..source.with_targets.len())]
-            };
-            let (sequence, targets) = &source.usable[place];
-            last = source.sequences[*sequence].id().to_owned();
-            let drawn = if region {
-                self.draw_region(index, *sequence, rng)?
-            } else if targets.is_empty() {
-                None
-            } else {
-                let target = targets[rng.random_range(0..targets.len())];
-                self.draw_target(index, *sequence, target, rng)?
-            };
-            if let Some(drawn) = drawn {
+            let Some(index) = self.mix.draw_source(cross, rng) else { break };
+            for _ in 0..SEQUENCE_TRIES {
+                let Some((drawn, sequence)) = self.draw_from(index, cross, rng)? else { break };
+                if let Some(mut drawn) = drawn {
+                    let modality = drawn.search.at.modality;
+                    drawn.distractor =
+                        self.draw_other(index, sequence, modality, self.config.distractor_p, rng)?;
+                    drawn.occluder =
+                        self.draw_other(index, sequence, modality, self.config.occluder_p, rng)?;
+                    return Ok(drawn);
+                }
+                last = self.sources[index].sequences[sequence].id();
+            }
+        }
+        Err(SampleError::NoSample { cross, last: last.to_owned() })
+    }
+
+    /// Draws a sequence of a source and a sample from it, which may not work out; `None` when the
+    /// source has nothing of this kind.
+    fn draw_from(
+        &self,
+        index: usize,
+        cross: bool,
+        rng: &mut impl Rng,
+    ) -> Result<Option<(Option<Drawn>, usize)>, SampleError> {
+        let source = &self.sources[index];
+        let pool = source.pool(cross);
+        let wanted = rng.random_bool(self.config.random_region_p);
+        let region = !pool.regions.is_empty() && (wanted || pool.targets.is_empty());
+        let Some(&place) = pick(if region { &pool.regions } else { &pool.targets }, rng) else {
+            return Ok(None);
+        };
+        let entry = &source.entries[place];
+        let drawn = if region {
+            self.draw_region(index, entry.sequence, cross, rng)?
+        } else {
+            let possible: Vec<&Target> =
+                entry.targets.iter().filter(|t| !cross || t.seen_by.len() > 1).collect();
+            match pick(&possible, rng) {
+                Some(target) => self.draw_target(index, entry.sequence, target, cross, rng)?,
+                None => None,
+            }
+        };
+        Ok(Some((drawn, entry.sequence)))
+    }
+
+    /// With chance `p`, a frame of another sequence than `not` of the source, with a target seen by
+    /// `modality`. Of the same sequence it could be the very target, which would have two places.
+    fn draw_other(
+        &self,
+        index: usize,
+        not: usize,
+        modality: Modality,
+        p: f64,
+        rng: &mut impl Rng,
+    ) -> Result<Option<DrawnFrame>, SampleError> {
+        if p <= 0.0 || !rng.random_bool(p) {
+            return Ok(None);
+        }
+        let source = &self.sources[index];
+        for _ in 0..SEQUENCE_TRIES {
+            let Some(&place) = pick(&source.pool(false).targets, rng) else { break };
+            let entry = &source.entries[place];
+            let Some(target) = pick(&entry.targets, rng) else { continue };
+            if entry.sequence == not {
+                continue;
+            }
+            let clip = source.sequences[entry.sequence].as_ref();
+            let frame = rng.random_range(0..clip.frames().max(1));
+            let truth = clip.truth(target.index, frame, modality);
+            let Some(bbox) = truth.filter(|b| self.config.usable(b)) else { continue };
+            let drawn = self.frame(index, entry.sequence, frame, modality, bbox)?;
+            if drawn.is_some() {
                 return Ok(drawn);
             }
         }
-        Err(SampleError::NoSample { last })
+        Ok(None)
     }
 
-    fn draw_source(&self, rng: &mut impl Rng) -> Option<usize> {
-        let total: f64 = self.sources.iter().map(|s| s.weight).sum();
-        let mut at = rng.random::<f64>() * total;
-        for (i, source) in self.sources.iter().enumerate() {
-            at -= source.weight;
-            if at < 0.0 {
-                return Some(i);
-            }
-        }
-        self.sources.len().checked_sub(1)
-    }
-
-    /// Sensor of the templates and of the search frame.
-    fn draw_modalities(
-        &self,
-        sequence: &dyn Sequence,
-        rng: &mut impl Rng,
-    ) -> Option<(Modality, Modality)> {
-        let present = sequence.modalities();
-        if present.is_empty() {
-            return None;
-        }
-        let template = present[rng.random_range(0..present.len())];
-        let cross = rng.random_bool(self.config.cross_modal_p);
-        let other = template.other();
-        let search = if cross && present.contains(&other) { other } else { template };
-        Some((template, search))
-    }
-
+    /// The frame with its picture; `None` when the box lies wholly outside of it.
     fn frame(
         &self,
         source: usize,
@@ -243,52 +333,69 @@ impl Sampler {
         frame: usize,
         modality: Modality,
         bbox: BBox,
-    ) -> Result<DrawnFrame, SampleError> {
+    ) -> Result<Option<DrawnFrame>, SampleError> {
         let at = FrameRef { source, sequence, frame, modality };
         let picture = self.cache.get(at, self.sources[source].sequences[sequence].as_ref())?;
-        Ok(DrawnFrame { at, bbox, picture })
+        let inside = bbox.overlaps_image(picture.width, picture.height);
+        Ok(inside.then_some(DrawnFrame { at, bbox, picture }))
     }
 
     fn draw_region(
         &self,
         source: usize,
         sequence: usize,
+        cross: bool,
         rng: &mut impl Rng,
     ) -> Result<Option<Drawn>, SampleError> {
         let clip = self.sources[source].sequences[sequence].as_ref();
-        let Some((template, search)) = self.draw_modalities(clip, rng) else { return Ok(None) };
+        let Some((template, search)) = draw_sensors(clip.modalities(), cross, rng) else {
+            return Ok(None);
+        };
         let frame = rng.random_range(0..clip.frames().max(1));
-        let mut pictures = Vec::new();
-        for &modality in clip.modalities() {
-            pictures.push(self.frame(source, sequence, frame, modality, BBox::default())?);
-        }
-        let views: Vec<&Picture> = pictures.iter().map(|p| p.picture.as_ref()).collect();
-        let Some(bbox) = region::draw(&views, &self.config, rng) else { return Ok(None) };
-        let of = |modality| self.frame(source, sequence, frame, modality, bbox);
-        let templates =
-            (0..self.config.templates).map(|_| of(template)).collect::<Result<Vec<_>, _>>()?;
+        let picture =
+            |modality| self.cache.get(FrameRef { source, sequence, frame, modality }, clip);
+        let (first, second) = (picture(template)?, picture(search)?);
+        let views = [first.as_ref(), second.as_ref()];
+        let views = if cross { &views[..] } else { &views[..1] };
+        let Some(bbox) = region::draw(views, &self.config, rng) else { return Ok(None) };
+        let of = |modality, picture: &Arc<Picture>| {
+            let at = FrameRef { source, sequence, frame, modality };
+            DrawnFrame { at, bbox, picture: picture.clone() }
+        };
         let id = format!(
-            "{}#region({:.0},{:.0},{:.0},{:.0}) {template}->{search}",
+            "{}: {}#region({:.0},{:.0},{:.0},{:.0}) frame {frame} {template}->{search}",
+            self.sources[source].label,
             clip.id(),
             bbox.x,
             bbox.y,
             bbox.w,
             bbox.h
         );
-        Ok(Some(Drawn { id, templates, search: of(search)?, region: true }))
+        let templates = (0..self.config.templates).map(|_| of(template, &first)).collect();
+        Ok(Some(Drawn {
+            id,
+            templates,
+            search: of(search, &second),
+            region: true,
+            distractor: None,
+            occluder: None,
+        }))
     }
 
     fn draw_target(
         &self,
         source: usize,
         sequence: usize,
-        target: usize,
+        target: &Target,
+        cross: bool,
         rng: &mut impl Rng,
     ) -> Result<Option<Drawn>, SampleError> {
         let clip = self.sources[source].sequences[sequence].as_ref();
-        let Some((template, search)) = self.draw_modalities(clip, rng) else { return Ok(None) };
+        let Some((template, search)) = draw_sensors(&target.seen_by, cross, rng) else {
+            return Ok(None);
+        };
         let seen = |frame: usize, modality: Modality| {
-            clip.truth(target, frame, modality).filter(|b| self.config.usable(b))
+            clip.truth(target.index, frame, modality).filter(|b| self.config.usable(b))
         };
         let frames = if clip.frames() == 1 {
             Some((vec![0; self.config.templates], 0))
@@ -302,19 +409,40 @@ impl Sampler {
             )
         };
         let Some((template_frames, search_frame)) = frames else { return Ok(None) };
-        let mut templates = Vec::new();
-        for &frame in &template_frames {
-            let Some(bbox) = seen(frame, template) else { return Ok(None) };
-            templates.push(self.frame(source, sequence, frame, template, bbox)?);
-        }
-        let Some(bbox) = seen(search_frame, search) else { return Ok(None) };
         let id = format!(
-            "{}#{target} frames {template_frames:?}->{search_frame} {template}->{search}",
-            clip.id()
+            "{}: {}#{} frames {template_frames:?}->{search_frame} {template}->{search}",
+            self.sources[source].label,
+            clip.id(),
+            target.index
         );
-        let search = self.frame(source, sequence, search_frame, search, bbox)?;
-        Ok(Some(Drawn { id, templates, search, region: false }))
+        let of = |frame, modality| match seen(frame, modality) {
+            Some(bbox) => self.frame(source, sequence, frame, modality, bbox),
+            None => Ok(None),
+        };
+        let mut templates = Vec::with_capacity(template_frames.len());
+        for frame in template_frames {
+            let Some(drawn) = of(frame, template)? else { return Ok(None) };
+            templates.push(drawn);
+        }
+        let Some(search) = of(search_frame, search)? else { return Ok(None) };
+        Ok(Some(Drawn { id, templates, search, region: false, distractor: None, occluder: None }))
     }
+}
+
+/// One of `items`, uniformly.
+fn pick<'a, T>(items: &'a [T], rng: &mut impl Rng) -> Option<&'a T> {
+    if items.is_empty() { None } else { items.get(rng.random_range(0..items.len())) }
+}
+
+/// Sensor of the templates, uniform among `sensors`, and of the search frame.
+fn draw_sensors(
+    sensors: &[Modality],
+    cross: bool,
+    rng: &mut impl Rng,
+) -> Option<(Modality, Modality)> {
+    let template = *pick(sensors, rng)?;
+    let search = if cross { template.other() } else { template };
+    sensors.contains(&search).then_some((template, search))
 }
 
 impl SamplerConfig {
@@ -328,85 +456,7 @@ fn least_visible(config: &SamplerConfig) -> usize {
     2 * (config.templates + 1)
 }
 
-impl Source {
-    fn new(
-        sequences: Vec<Box<dyn Sequence>>,
-        registered: bool,
-        weight: f64,
-        config: &SamplerConfig,
-    ) -> Option<Self> {
-        let regions = registered && config.random_region_p > 0.0;
-        let mut usable = Vec::new();
-        for (i, sequence) in sequences.iter().enumerate() {
-            let frames = sequence.frames();
-            let enough = if frames == 1 { 1 } else { least_visible(config) + 1 };
-            let targets: Vec<usize> = (0..sequence.targets())
-                .filter(|&target| {
-                    (frames == 1 || frames >= MIN_FRAMES)
-                        && sequence.modalities().iter().any(|&m| {
-                            let seen = |f: &usize| {
-                                sequence.truth(target, *f, m).is_some_and(|b| config.usable(&b))
-                            };
-                            (0..frames).filter(seen).take(enough).count() == enough
-                        })
-                })
-                .collect();
-            if !targets.is_empty() || regions {
-                usable.push((i, targets));
-            }
-        }
-        let with_targets: Vec<usize> =
-            (0..usable.len()).filter(|&i| !usable[i].1.is_empty()).collect();
-        (!usable.is_empty() && (regions || !with_targets.is_empty())).then_some(Self {
-            sequences,
-            registered,
-            weight,
-            usable,
-            with_targets,
-        })
-    }
-}
-
-/// Causal frames of a video (spec 2.1): a base template, earlier further templates, a later search
-/// frame, all within `gap`, which widens by 5 until every range has a visible frame.
-fn draw_causal(
-    frames: usize,
-    config: &SamplerConfig,
-    template_seen: impl Fn(usize) -> bool,
-    search_seen: impl Fn(usize) -> bool,
-    rng: &mut impl Rng,
-) -> Option<(Vec<usize>, usize)> {
-    let visible = |range: std::ops::Range<usize>, seen: &dyn Fn(usize) -> bool| -> Vec<usize> {
-        range.filter(|f| seen(*f)).collect()
-    };
-    let bases = visible(1..frames.saturating_sub(1), &template_seen);
-    if bases.is_empty() {
-        return None;
-    }
-    let mut extra = 0;
-    // Past the length of the clip, widening changes nothing any more; a few draws of other bases
-    // are still worth it.
-    while extra <= frames + 100 {
-        let base = bases[rng.random_range(0..bases.len())];
-        let reach = config.gap + extra;
-        let earlier = visible(base.saturating_sub(reach)..base, &template_seen);
-        let later = visible(base + 1..(base + reach).min(frames), &search_seen);
-        if later.is_empty() || (earlier.is_empty() && config.templates > 1) {
-            extra += 5;
-            continue;
-        }
-        let mut templates = vec![base];
-        for _ in 1..config.templates {
-            templates.push(earlier[rng.random_range(0..earlier.len())]);
-        }
-        return Some((templates, later[rng.random_range(0..later.len())]));
-    }
-    None
-}
-
-fn boxed<S: Sequence + 'static>(items: Vec<S>) -> Vec<Box<dyn Sequence>> {
-    items.into_iter().map(|s| Box::new(s) as Box<dyn Sequence>).collect()
-}
-
+#[cfg(test)]
+mod mixed_tests;
 #[cfg(test)]
 mod tests;

@@ -337,6 +337,61 @@ fn evaluate(bytes: &[u8], x: (&[usize], &[f32]), y: &[usize]) -> Vec<f32> {
     team.view(to..to + y.iter().product::<usize>()).to_vec()
 }
 
+/// Hard-swish as one node and written out, alone and behind a gate: the same numbers, and one step
+/// for what was written in two or three.
+#[test]
+fn hard_swish_in_all_its_forms() {
+    let x: Vec<f32> = (0..24).map(|i| 0.5 * i as f32 - 6.0).collect();
+    let gates = [0.25, 0.0, 1.0];
+    let sixth = || vec![float("alpha", 1.0 / 6.0), float("beta", 0.5)];
+    let swish = |v: f32| v * (v / 6.0 + 0.5).clamp(0.0, 1.0);
+    let file = |nodes| {
+        let constants = vec![floats("gate", &[1, 3, 1, 1], &gates)];
+        model(nodes, vec![port("x", &[1, 3, 2, 4])], vec![port("y", &[1, 3, 2, 4])], constants)
+    };
+    let gate = || node("Mul", &["x", "gate"], "g", vec![]);
+    let cases = [
+        (file(vec![node("HardSwish", &["x"], "y", vec![])]), false),
+        (
+            file(vec![
+                node("HardSigmoid", &["x"], "h", sixth()),
+                node("Mul", &["x", "h"], "y", vec![]),
+            ]),
+            false,
+        ),
+        (
+            file(vec![
+                gate(),
+                node("HardSigmoid", &["g"], "h", sixth()),
+                node("Mul", &["h", "g"], "y", vec![]),
+            ]),
+            true,
+        ),
+        (file(vec![gate(), node("HardSwish", &["g"], "y", vec![])]), true),
+    ];
+    for (i, (bytes, gated)) in cases.iter().enumerate() {
+        let mut graph = graph::read(bytes, &[]).unwrap();
+        graph::fuse(&mut graph);
+        assert_eq!(graph.nodes.len(), 1, "case {i}");
+        let found = evaluate(bytes, (&[1, 3, 2, 4], &x), &[1, 3, 2, 4]);
+        for (j, (y, x)) in found.iter().zip(&x).enumerate() {
+            let want = swish(if *gated { x * gates[j / 8] } else { *x });
+            assert!((y - want).abs() <= 1e-6, "case {i}, element {j}: {y}, not {want}");
+        }
+    }
+    // Another slope is another function, and a product that is used twice stays.
+    let other = file(vec![
+        node("HardSigmoid", &["x"], "h", vec![float("alpha", 0.2)]),
+        node("Mul", &["x", "h"], "y", vec![]),
+    ]);
+    let mut graph = graph::read(&other, &[]).unwrap();
+    graph::fuse(&mut graph);
+    assert_eq!(graph.nodes.len(), 2);
+    let found = evaluate(&other, (&[1, 3, 2, 4], &x), &[1, 3, 2, 4]);
+    let want = |x: f32| x * (0.2 * x + 0.5).clamp(0.0, 1.0);
+    assert!(found.iter().zip(&x).all(|(y, x)| (y - want(*x)).abs() <= 1e-6));
+}
+
 /// Layouts that need copies, constants that need computing, operators in unusual places.
 #[test]
 fn moves_and_constants() {

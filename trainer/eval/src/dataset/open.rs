@@ -23,6 +23,16 @@ pub struct Kind {
     pub options: &'static [&'static str],
 }
 
+impl fmt::Display for Kind {
+    /// `otb[/thermal|/zero-based]`: the name and what may follow it.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.options {
+            [] => f.write_str(self.name),
+            options => write!(f, "{}[/{}]", self.name, options.join("|/")),
+        }
+    }
+}
+
 const fn kind(name: &'static str, about: &'static str, options: &'static [&'static str]) -> Kind {
     Kind { name, about, options }
 }
@@ -135,11 +145,7 @@ impl fmt::Debug for Scan {
 
 /// `KIND:PATH[@split] ..` for messages.
 fn kinds() -> String {
-    let one = |k: &Kind| match k.options {
-        [] => k.name.to_owned(),
-        options => format!("{}[/{}]", k.name, options.join("|/")),
-    };
-    KINDS.iter().map(one).collect::<Vec<_>>().join(", ")
+    KINDS.iter().map(Kind::to_string).collect::<Vec<_>>().join(", ")
 }
 
 /// A dataset text that cannot be opened.
@@ -204,12 +210,19 @@ struct Parsed<'a> {
     split: Split,
 }
 
-fn parse(text: &str) -> Result<Parsed<'_>, OpenError> {
-    let no_kind = || OpenError::Kind { text: text.to_owned() };
-    let (head, rest) = text.split_once(':').ok_or_else(no_kind)?;
+/// Takes `KIND[/option..]` apart: what stands before the colon of a dataset text.
+///
+/// # Errors
+/// For an unknown kind, or an option it does not have.
+pub fn kind_of(head: &str) -> Result<(&'static Kind, Vec<&str>), OpenError> {
+    read_kind(head, head)
+}
+
+fn read_kind<'a>(head: &'a str, text: &str) -> Result<(&'static Kind, Vec<&'a str>), OpenError> {
     let mut words = head.split('/');
     let name = words.next().unwrap_or_default();
-    let kind = KINDS.iter().find(|k| k.name == name).ok_or_else(no_kind)?;
+    let known = KINDS.iter().find(|k| k.name == name);
+    let kind = known.ok_or_else(|| OpenError::Kind { text: text.to_owned() })?;
     let options: Vec<&str> = words.collect();
     if let Some(option) = options.iter().find(|o| !kind.options.contains(o)) {
         return Err(OpenError::Option {
@@ -219,6 +232,13 @@ fn parse(text: &str) -> Result<Parsed<'_>, OpenError> {
             options: kind.options,
         });
     }
+    Ok((kind, options))
+}
+
+fn parse(text: &str) -> Result<Parsed<'_>, OpenError> {
+    let no_kind = || OpenError::Kind { text: text.to_owned() };
+    let (head, rest) = text.split_once(':').ok_or_else(no_kind)?;
+    let (kind, options) = read_kind(head, text)?;
     // An '@' followed by a path separator belongs to the path.
     let (path, split) = match rest.rsplit_once('@') {
         Some((path, split)) if !split.contains(['/', '\\']) => {

@@ -1,6 +1,5 @@
 //! The model card: what a bundle says about itself.
 
-use tsda_runtime::Backbone;
 use tsda_runtime::bundle::Manifest;
 
 use super::html::Html;
@@ -25,12 +24,7 @@ impl ModelCard {
     pub fn of(manifest: &Manifest<'_>, bytes: usize) -> Self {
         let s = &manifest.spec;
         let p = &manifest.provenance;
-        let backbone = match s.backbone {
-            Backbone::EfficientNetLite0 => "EfficientNet-Lite0 to stride 16".to_owned(),
-            Backbone::ResNet { base_channels, blocks } => {
-                format!("ResNet, {base_channels} channels, blocks {blocks:?}")
-            }
-        };
+        let backbone = s.backbone.to_string();
         let t = manifest.trained_on;
         let sensors = [(t.rgb, "RGB"), (t.thermal, "thermal"), (t.cross_modal, "across both")];
         let sensors: Vec<&str> = sensors.iter().filter(|s| s.0).map(|s| s.1).collect();

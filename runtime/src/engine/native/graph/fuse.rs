@@ -1,5 +1,7 @@
-//! Groups of operators that are cheaper as one: attention, normalisation of a whole map, and what
-//! follows a product (bias, residual, limits). Whatever does not match stays as it is.
+//! Groups of operators that are cheaper as one: attention, normalisation of a whole map,
+//! hard-swish, and what follows a product (bias, residual, limits). Whatever does not match stays as it is.
+
+mod swish;
 
 use super::{Binary, Graph, Node, Op, Post, Reduce, UNLIMITED, Unary, ValueId};
 
@@ -7,6 +9,7 @@ use super::{Binary, Graph, Node, Op, Post, Reduce, UNLIMITED, Unary, ValueId};
 pub fn fuse(graph: &mut Graph<'_>) {
     attention(graph);
     map_norms(graph);
+    swish::fuse(graph);
     sweep(graph);
     followers(graph);
     sweep(graph);

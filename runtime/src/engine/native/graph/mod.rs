@@ -79,6 +79,10 @@ pub enum Unary {
     Reciprocal,
     /// `1 / (1 + e^-x)`.
     Sigmoid,
+    /// `clamp(alpha * x + beta, 0, 1)`.
+    HardSigmoid(f32, f32),
+    /// `x * clamp(x / 6 + 1 / 2, 0, 1)`.
+    HardSwish,
     /// `-x`.
     Neg,
     /// Absolute value.
@@ -110,6 +114,8 @@ pub enum Binary {
     Max,
     /// Power.
     Pow,
+    /// Hard-swish of the product; see [`Unary::HardSwish`].
+    MulHardSwish,
 }
 
 /// What a reduction computes.

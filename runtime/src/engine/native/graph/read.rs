@@ -341,6 +341,11 @@ impl<'a> Reader<'a> {
             "Sqrt" => self.unary(&call, Unary::Sqrt),
             "Reciprocal" => self.unary(&call, Unary::Reciprocal),
             "Sigmoid" => self.unary(&call, Unary::Sigmoid),
+            "HardSigmoid" => {
+                let (alpha, beta) = (call.float("alpha", 0.2), call.float("beta", 0.5));
+                self.unary(&call, Unary::HardSigmoid(alpha, beta))
+            }
+            "HardSwish" => self.unary(&call, Unary::HardSwish),
             "Neg" => self.unary(&call, Unary::Neg),
             "Abs" => self.unary(&call, Unary::Abs),
             "Log" => self.unary(&call, Unary::Log),

@@ -152,6 +152,19 @@ impl Copy {
     }
 }
 
+/// `x` limited to 0 to 1; not a number stays one.
+#[inline(always)]
+fn ramp(x: f32) -> f32 {
+    let x = if x < 0.0 { 0.0 } else { x };
+    if x > 1.0 { 1.0 } else { x }
+}
+
+/// See [`Unary::HardSwish`].
+#[inline(always)]
+fn hard_swish(x: f32) -> f32 {
+    x * ramp(x * (1.0 / 6.0) + 0.5)
+}
+
 /// A function of every element.
 #[derive(Clone, Debug)]
 pub struct Map {
@@ -182,6 +195,10 @@ pub unsafe fn map(s: &Map, mem: Mem, part: Part) {
             Unary::Sqrt => map_with(s, mem, part, f32::sqrt),
             Unary::Reciprocal => map_with(s, mem, part, f32::recip),
             Unary::Sigmoid => map_with(s, mem, part, |x| 1.0 / (1.0 + (-x).exp())),
+            Unary::HardSigmoid(alpha, beta) => {
+                map_with(s, mem, part, |x| ramp(alpha * x + beta));
+            }
+            Unary::HardSwish => map_with(s, mem, part, hard_swish),
             Unary::Neg => map_with(s, mem, part, |x| -x),
             Unary::Abs => map_with(s, mem, part, f32::abs),
             Unary::Log => map_with(s, mem, part, f32::ln),
@@ -239,6 +256,7 @@ pub unsafe fn zip(s: &Zip, mem: Mem, part: Part) {
             Binary::Min => zip_with(s, mem, part, |a, b| if b < a { b } else { a }),
             Binary::Max => zip_with(s, mem, part, |a, b| if b > a { b } else { a }),
             Binary::Pow => zip_with(s, mem, part, f32::powf),
+            Binary::MulHardSwish => zip_with(s, mem, part, |a, b| hard_swish(a * b)),
         }
     }
 }

@@ -479,10 +479,12 @@ proptest! {
 fn functions_and_reductions() {
     let input = numbers(60, 1);
     type Function = fn(f32) -> f32;
-    let functions: [(Unary, Function); 5] = [
+    let functions: [(Unary, Function); 7] = [
         (Unary::Clamp(-0.5, 0.5), |x| x.clamp(-0.5, 0.5)),
         (Unary::Exp, f32::exp),
         (Unary::Sigmoid, |x| 1.0 / (1.0 + (-x).exp())),
+        (Unary::HardSigmoid(0.4, 0.25), |x| (0.4 * x + 0.25).clamp(0.0, 1.0)),
+        (Unary::HardSwish, |x| x * (x / 6.0 + 0.5).clamp(0.0, 1.0)),
         (Unary::Abs, f32::abs),
         (Unary::Neg, |x| -x),
     ];
