@@ -2,6 +2,7 @@
 
 use crate::error::HostError;
 use clap::Args;
+use std::fmt;
 use tsda_runtime::{RedetectOptions, Tracker};
 
 /// `--scan-when-lost` and `--scan-threshold`.
@@ -27,15 +28,34 @@ impl RedetectArgs {
         })
     }
 
+    /// Checks the values.
+    ///
+    /// # Errors
+    /// When the threshold is out of range.
+    pub fn validate(&self) -> Result<(), HostError> {
+        self.options().map_or(Ok(()), |o| o.validate()).map_err(out_of_range)
+    }
+
     /// Sets a tracker up.
     ///
     /// # Errors
     /// When the threshold is out of range.
     pub fn apply<E>(&self, tracker: &mut Tracker<E>) -> Result<(), HostError> {
-        tracker.set_redetection(self.options()).map_err(|e| HostError::Argument {
-            what: "--scan-threshold".into(),
-            reason: e.to_string(),
-        })
+        tracker.set_redetection(self.options()).map_err(out_of_range)
+    }
+}
+
+fn out_of_range(e: impl fmt::Display) -> HostError {
+    HostError::Argument { what: "--scan-threshold".into(), reason: e.to_string() }
+}
+
+/// What sets results apart from those without the options; empty without them.
+impl fmt::Display for RedetectArgs {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Some(options) = self.options() else { return Ok(()) };
+        // As JSON, which has every field there is.
+        let json = serde_json::to_string(&options).map_err(|_| fmt::Error)?;
+        write!(f, "scan {json}")
     }
 }
 
@@ -60,6 +80,15 @@ mod tests {
         assert_eq!(parse(&["--scan-when-lost"]).expect("alone"), Some(RedetectOptions::default()));
         let both = parse(&["--scan-when-lost=5", "--scan-threshold", "0.8"]).expect("both");
         assert_eq!(both, Some(RedetectOptions { positions_per_frame: 5, threshold: 0.8 }));
+        let text = |args: &[&str]| {
+            let args = ["program"].iter().chain(args);
+            Program::try_parse_from(args).map(|p| p.redetect.to_string()).expect("arguments")
+        };
+        assert_eq!(text(&[]), "");
+        assert_eq!(
+            text(&["--scan-when-lost=5", "--scan-threshold", "0.8"]),
+            "scan {\"positions_per_frame\":5,\"threshold\":0.8}"
+        );
         assert!(parse(&["--scan-threshold", "0.8"]).is_err());
         assert!(parse(&["--scan-when-lost=0"]).is_err());
     }

@@ -204,6 +204,92 @@ fn what_cannot_be_evaluated_ends_with_2_and_one_line() {
     assert_eq!(protocols, ["rgb"]);
 }
 
+#[test]
+fn options_of_the_scan_belong_to_the_run() {
+    let dir = tempfile::tempdir().expect("temp");
+    lasher(dir.path(), &["a"]);
+    let run = |more: &[&str]| eval(dir.path(), &[&SWITCH[..], more].concat());
+    let scan = ["--scan-when-lost=3", "--scan-threshold", "0.75"];
+    let first = run(&scan);
+    assert_eq!(first.status.code(), Some(0), "{}", said(&first));
+    let settings = "scan {\"positions_per_frame\":3,\"threshold\":0.75}";
+    let summary = || json(&dir.path().join("out/summary.json"));
+    assert_eq!(summary()["settings"], settings);
+    assert!(said(&run(&scan)).contains("1 of 1 sequences taken up"));
+    for (more, now) in [
+        (&[][..], "none"),
+        (&["--scan-when-lost"], "\"positions_per_frame\":2"),
+        (&["--scan-when-lost=3", "--scan-threshold", "0.8"], "\"threshold\":0.8"),
+    ] {
+        let output = run(more);
+        let text = said(&output);
+        assert_eq!(output.status.code(), Some(2), "{more:?}: {text}");
+        let difference = format!("settings {settings}, now ");
+        assert!(text.contains(&difference) && text.contains(now), "{more:?}: {text}");
+    }
+    let plain = run(&["--fresh"]);
+    assert_eq!(plain.status.code(), Some(0), "{}", said(&plain));
+    assert!(summary().get("settings").is_none());
+    let output = run(&["--fresh", "--scan-when-lost", "--scan-threshold", "nan"]);
+    assert_eq!(output.status.code(), Some(2), "{}", said(&output));
+    assert!(said(&output).contains("--scan-threshold"), "{}", said(&output));
+    // Refused before anything was thrown away.
+    assert!(said(&run(&[])).contains("1 of 1 sequences taken up"));
+}
+
+/// Registered stills of 160 x 128 with one target each.
+fn pairs(dir: &Path, ids: &[&str]) {
+    fs::create_dir_all(dir.join("pairs")).expect("mkdir");
+    let mut entries = Vec::new();
+    for id in ids {
+        for sensor in ["v", "i"] {
+            let picture = image::GrayImage::from_fn(160, 128, |x, y| {
+                let inside = (60..90).contains(&x) && (50..76).contains(&y);
+                image::Luma([if inside { 220 } else { ((x * 7 + y * 13) % 60) as u8 }])
+            });
+            picture.save(dir.join(format!("pairs/{id}_{sensor}.png"))).expect("png");
+        }
+        entries.push(serde_json::json!({
+            "id": id, "split": "val", "visible": format!("{id}_v.png"),
+            "infrared": format!("{id}_i.png"), "width": 160, "height": 128,
+            "boxes": [{"xywh": [60, 50, 30, 26], "cls": "x"}],
+        }));
+    }
+    let index = serde_json::json!({ "pairs": entries }).to_string();
+    fs::write(dir.join("pairs/index.json"), index).expect("index");
+}
+
+#[test]
+fn a_broken_still_costs_its_clips_only() {
+    let dir = tempfile::tempdir().expect("temp");
+    pairs(dir.path(), &["a", "b", "c", "d"]);
+    fs::write(dir.path().join("pairs/b_i.png"), "no picture").expect("broken");
+    image::GrayImage::new(80, 64).save(dir.path().join("pairs/c_v.png")).expect("png");
+    let set = ["--dataset", "pseudo:pairs@val", "--pseudo-frames", "4", "--out", "out"];
+    let output = eval(dir.path(), &set);
+    let text = said(&output);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    for words in ["b_i.png", "c_v.png", "2 sequences failed"] {
+        assert!(text.contains(words), "no {words} in {text}");
+    }
+    // Too short for the default: said, not hidden.
+    assert!(text.contains("switch:200: the longest sequence has 4 frames"), "{text}");
+    let summary = json(&dir.path().join("out/summary.json"));
+    let protocols: Vec<_> = summary["protocols"].as_object().expect("object").keys().collect();
+    assert_eq!(protocols, ["rgb2t", "switch:200", "t2rgb"]);
+    assert_eq!(summary["protocols"]["rgb2t"]["sequences"], 2);
+    assert_eq!(summary["broken"].as_array().expect("broken").len(), 2);
+    assert!(summary["broken"][0]["path"].as_str().expect("path").ends_with("b_i.png"));
+
+    // All broken: nothing to track, one line.
+    for id in ["a", "d"] {
+        fs::write(dir.path().join(format!("pairs/{id}_v.png")), "no picture").expect("broken");
+    }
+    let output = eval(dir.path(), &[&set[..], &["--fresh"]].concat());
+    assert_eq!(output.status.code(), Some(2), "{}", said(&output));
+    assert_eq!(said(&output).trim_end().lines().count(), 1, "{}", said(&output));
+}
+
 /// Ctrl-C: code 3, one line, finished sequences kept, the same command goes on.
 #[cfg(unix)]
 #[test]

@@ -4,16 +4,15 @@ use super::{EvalArgs, progress_bar, stop_flag};
 use crate::error::{EXIT_CHECK_FAILED, EXIT_OK, EXIT_RUNTIME, HostError, one_line};
 use crate::model;
 use crate::output::write_file;
+use crate::redetect::RedetectArgs;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
-use std::str::FromStr as _;
 use std::sync::atomic::Ordering;
 use tsda_eval::baselines::{MatchOn, StaticBox, TemplateMatcher};
-use tsda_eval::dataset::pairs::PairsDataset;
-use tsda_eval::dataset::{self, Dataset, Picture, Scan, Sequence, Split};
-use tsda_eval::evaluate::{Extent, Failure, Observer, can_run};
+use tsda_eval::dataset::{self, Dataset, Picture, Scan};
+use tsda_eval::evaluate::{Extent, Failure, Observer, can_run, never_switches};
 use tsda_eval::protocol::{EvalError, Protocol, TrackerError, TrackerUnderTest};
-use tsda_eval::pseudo::{PseudoOptions, clips};
+use tsda_eval::pseudo::PseudoOptions;
 use tsda_eval::report_data::DataOptions;
 use tsda_eval::results::file_stem;
 use tsda_eval::run_summary::{RunContext, RunSummary, convention_of, sum_up};
@@ -34,9 +33,14 @@ struct BundleTracker {
 }
 
 impl BundleTracker {
-    fn new(file: &BundleFile, choice: &EngineChoice) -> Result<Self, HostError> {
+    fn new(
+        file: &BundleFile,
+        choice: &EngineChoice,
+        redetect: RedetectArgs,
+    ) -> Result<Self, HostError> {
         let name = file.bundle()?.manifest().name.to_owned();
-        let tracker = model::tracker_on(file, choice)?;
+        let mut tracker = model::tracker_on(file, choice)?;
+        redetect.apply(&mut tracker)?;
         Ok(Self { name, tracker, size: (0, 0), last: BBox::default() })
     }
 }
@@ -71,6 +75,8 @@ struct Entry<'a> {
     name: String,
     model: String,
     engine: String,
+    /// Other than the bundle's own settings.
+    settings: String,
     make: Maker<'a>,
     /// One per protocol.
     stores: Vec<ResultStore>,
@@ -82,6 +88,7 @@ impl<'a> Entry<'a> {
             name: tracker.name().to_owned(),
             model: "built in".into(),
             engine: String::new(),
+            settings: String::new(),
             make: Box::new(move || Ok(Box::new(tracker.clone()))),
             stores: Vec::new(),
         }
@@ -93,15 +100,21 @@ pub(super) fn run(args: &EvalArgs) -> Result<u8, HostError> {
     let parsed = bundle.bundle()?;
     // An engine that cannot be had should be known before the data are looked at.
     drop(model::engine(&bundle, &parsed, &args.engine)?);
+    args.redetect.validate()?;
     let (data, broken) = open(args)?;
     let protocols = protocols(args, &data)?;
+    for note in protocols.iter().filter_map(|p| never_switches(&data, *p)) {
+        eprintln!("tsda: {note}");
+    }
 
     let mut entries = vec![Entry {
         name: parsed.manifest().name.to_owned(),
         model: fingerprint::of_bytes(bundle.bytes()),
         engine: args.engine.to_string(),
+        settings: args.redetect.to_string(),
         make: Box::new(|| {
-            let tracker = BundleTracker::new(&bundle, &args.engine).map_err(TrackerError::new)?;
+            let tracker = BundleTracker::new(&bundle, &args.engine, args.redetect)
+                .map_err(TrackerError::new)?;
             Ok(Box::new(tracker) as Box<dyn TrackerUnderTest>)
         }),
         stores: Vec::new(),
@@ -114,6 +127,7 @@ pub(super) fn run(args: &EvalArgs) -> Result<u8, HostError> {
     let context = RunContext {
         bundle: entries[0].model.clone(),
         engine: entries[0].engine.clone(),
+        settings: entries[0].settings.clone(),
         dataset_hash: fingerprint::of_dataset(&data),
         jobs: args.jobs.max(1),
         broken,
@@ -235,6 +249,7 @@ fn prepare(
                 tracker: entry.name.clone(),
                 model: entry.model.clone(),
                 engine: entry.engine.clone(),
+                settings: entry.settings.clone(),
                 dataset: data.name.clone(),
                 dataset_hash: context.dataset_hash.clone(),
                 protocol: protocol.clone(),
@@ -323,32 +338,19 @@ fn open(args: &EvalArgs) -> Result<(Dataset, Vec<Failure>), HostError> {
         what: format!("--dataset {}", args.dataset),
         reason: e.to_string(),
     };
-    let rest = args.dataset.strip_prefix("pseudo:").or(args.dataset.strip_prefix("pairs:"));
-    let Some(rest) = rest else {
-        let Scan { name, sequences, broken } =
-            dataset::scan(&args.dataset).map_err(|e| unusable(&e))?;
-        if let (Some(first), true) = (broken.first(), sequences.is_empty()) {
-            return Err(unusable(first));
-        }
-        for e in &broken {
-            eprintln!("tsda: cannot be opened and is left out: {}", one_line(e));
-        }
-        let broken = broken.iter().map(Failure::of_dataset).collect();
-        return Ok((Dataset { name, sequences }, broken));
+    let clips = PseudoOptions { frames: args.pseudo_frames, ..PseudoOptions::default() };
+    let text = match args.dataset.strip_prefix("pairs:") {
+        Some(rest) => format!("pseudo:{rest}"),
+        None => args.dataset.clone(),
     };
-    let (path, split) = match rest.rsplit_once('@') {
-        Some((path, split)) if !split.contains(['/', '\\']) => {
-            (path, Split::from_str(split).map_err(|e| unusable(&e))?)
-        }
-        _ => (rest, Split::All),
-    };
-    let pairs = PairsDataset::open(Path::new(path), split).map_err(|e| unusable(&e))?;
-    let options = PseudoOptions { frames: args.pseudo_frames, ..PseudoOptions::default() };
-    let stills = pairs.pairs().iter().map(|p| p as &dyn Sequence);
-    let clips = clips(stills, options).map_err(|e| unusable(&e))?;
-    if clips.is_empty() {
-        return Err(unusable(&"no target of a size that clips can be made from"));
+    let Scan { name, sequences, broken } =
+        dataset::scan_with(&text, clips).map_err(|e| unusable(&e))?;
+    if let (Some(first), true) = (broken.first(), sequences.is_empty()) {
+        return Err(unusable(first));
     }
-    let sequences = clips.into_iter().map(|c| Box::new(c) as Box<dyn Sequence>).collect();
-    Ok((Dataset { name: format!("pseudo:{rest}"), sequences }, Vec::new()))
+    for e in &broken {
+        eprintln!("tsda: cannot be opened and is left out: {}", one_line(e));
+    }
+    let broken = broken.iter().map(Failure::of_dataset).collect();
+    Ok((Dataset { name, sequences }, broken))
 }

@@ -216,8 +216,8 @@ pub struct EvalArgs {
     /// pseudo:PATH[@split] for clips made from registered stills
     #[arg(long, value_name = "KIND:PATH[@SPLIT]")]
     pub dataset: String,
-    /// rgb2t, t2rgb, switch:N, rgb or t; may be repeated [default: rgb2t t2rgb switch:20; on data of
-    /// one sensor rgb or t]
+    /// rgb2t, t2rgb, switch:N (switch: N = 200), rgb or t; may be repeated [default: rgb2t t2rgb
+    /// switch:200; on data of one sensor rgb or t]
     #[arg(long, value_name = "PROTOCOL")]
     pub protocol: Vec<tsda_eval::protocol::Protocol>,
     /// Folder for summary.json, summary.md, report.json and the results, made if needed. Sequences
@@ -244,6 +244,9 @@ pub struct EvalArgs {
     /// as ort,threads=2 (docs/engines.md)
     #[arg(long, value_name = "ENGINE", default_value_t)]
     pub engine: EngineChoice,
+    /// Looking for a lost target
+    #[command(flatten)]
+    pub redetect: RedetectArgs,
     /// Frames per clip made from stills
     #[arg(long, value_name = "N", default_value_t = 60)]
     pub pseudo_frames: usize,

@@ -29,8 +29,8 @@ pub struct RunsArgs {
     /// a screen; may be repeated
     #[arg(long, value_name = "KIND:PATH[@SPLIT]", required = true)]
     pub dataset: Vec<String>,
-    /// rgb2t, t2rgb, switch:N, rgb or t; may be repeated; sequences that lack a sensor of one are left
-    /// out of it [default: rgb2t t2rgb switch:20]
+    /// rgb2t, t2rgb, switch:N (switch: N = 200), rgb or t; may be repeated; sequences that lack a sensor
+    /// of one are left out of it [default: rgb2t t2rgb switch:200]
     #[arg(long, value_name = "PROTOCOL")]
     pub protocol: Vec<Protocol>,
     /// Where the network runs

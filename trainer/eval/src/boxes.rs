@@ -32,6 +32,14 @@ impl Layout {
     /// GTOT's truth.
     pub const GTOT: Self = Self::Corners { inclusive: false, round: false };
 
+    /// The numbers of a line, in words.
+    const fn expected(self) -> &'static str {
+        match self {
+            Self::Xywh => "x,y,w,h",
+            Self::Corners { .. } => "x1 y1 x2 y2",
+        }
+    }
+
     fn box_of(self, n: [f64; 4]) -> Row {
         let Self::Corners { inclusive, round } = self else { return n };
         let n = if round { n.map(|v| f64::from((v as f32).round_ties_even())) } else { n };
@@ -62,6 +70,13 @@ pub struct BadLine {
     pub reason: String,
 }
 
+impl BadLine {
+    /// The same, of a file.
+    pub(crate) fn in_file(self, path: &Path) -> DatasetError {
+        DatasetError::Format { path: path.to_owned(), line: self.line, reason: self.reason }
+    }
+}
+
 /// Reads boxes from a text; see the [module](self).
 ///
 /// # Errors
@@ -71,7 +86,7 @@ pub fn parse(text: &str, layout: Layout) -> Result<Vec<Row>, BadLine> {
     if text.is_empty() {
         return Err(BadLine {
             line: None,
-            reason: "no boxes in it: expected x,y,w,h per line".into(),
+            reason: format!("no boxes in it: expected {} per line", layout.expected()),
         });
     }
     lines(text)
@@ -84,14 +99,19 @@ pub fn parse(text: &str, layout: Layout) -> Result<Vec<Row>, BadLine> {
 
 /// Lines ended by LF, CRLF or a lone CR, which stands in RGBT234's `kite2/infrared.txt`; taken for a
 /// blank it would make one line of two boxes.
-fn lines(text: &str) -> impl Iterator<Item = &str> {
+pub(crate) fn lines(text: &str) -> impl Iterator<Item = &str> {
     text.lines().flat_map(|line| line.trim_end_matches('\r').split('\r'))
+}
+
+/// What stands between separators.
+pub(crate) fn fields(line: &str) -> impl Iterator<Item = &str> {
+    line.split([',', '\t', ' ', ';']).filter(|f| !f.is_empty())
 }
 
 fn parse_line(line: &str, layout: Layout) -> Result<Row, String> {
     let mut numbers = [0.0; 8];
     let mut n = 0;
-    for field in line.split([',', '\t', ' ', ';']).filter(|f| !f.is_empty()) {
+    for field in fields(line) {
         let value: f64 =
             field.parse().map_err(|_| format!("'{}' is not a number", shown(field)))?;
         if value.is_infinite() {
@@ -106,13 +126,20 @@ fn parse_line(line: &str, layout: Layout) -> Result<Row, String> {
     match n {
         4 => Ok(layout.box_of([a, b, c, d])),
         8 => Ok(enclosing(&numbers, false)),
-        0 => Err("expected four numbers x,y,w,h, found 0: an empty line between boxes".into()),
-        _ => Err(format!("expected four numbers x,y,w,h, found {n} in '{}'", shown(line.trim()))),
+        0 => Err(format!(
+            "expected four numbers {}, found 0: an empty line between boxes",
+            layout.expected()
+        )),
+        _ => Err(format!(
+            "expected four numbers {}, found {n} in '{}'",
+            layout.expected(),
+            shown(line.trim())
+        )),
     }
 }
 
 /// As much of a text as fits in a message.
-fn shown(text: &str) -> String {
+pub(crate) fn shown(text: &str) -> String {
     let mut short: String = text.chars().take(60).collect();
     if short.len() < text.len() {
         short.push_str("..");
@@ -126,11 +153,7 @@ fn shown(text: &str) -> String {
 /// When the file cannot be read or does not hold boxes; the error names file and line.
 pub fn read(path: &Path, layout: Layout) -> Result<Vec<Row>, DatasetError> {
     let text = read_text(path)?;
-    parse(&text, layout).map_err(|bad| DatasetError::Format {
-        path: path.to_owned(),
-        line: bad.line,
-        reason: bad.reason,
-    })
+    parse(&text, layout).map_err(|bad| bad.in_file(path))
 }
 
 /// A file as text; a stray byte makes one bad number with its line, not an unreadable file.

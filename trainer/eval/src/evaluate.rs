@@ -203,6 +203,21 @@ pub fn can_run(dataset: &Dataset, protocol: Protocol) -> bool {
     !jobs(dataset, protocol).0.is_empty()
 }
 
+/// A sentence for people when `protocol` switches between the sensors, but no run of it is long
+/// enough to come back to RGB: its figures are those of `rgb2t` then.
+pub fn never_switches(dataset: &Dataset, protocol: Protocol) -> Option<String> {
+    let Protocol::Switch { every } = protocol else { return None };
+    let longest = jobs(dataset, protocol).0.iter().map(|j| j.frames).max()?;
+    // Frame 0 is RGB, 1 to `every` thermal, the next one RGB again.
+    (longest <= every.saturating_add(1)).then(|| {
+        format!(
+            "{protocol}: the longest sequence has {longest} frames, so the sensor never changes back \
+             and the figures are those of rgb2t; a smaller N, such as switch:{}, does change",
+            (longest / 3).max(1)
+        )
+    })
+}
+
 /// Makes a tracker for one thread.
 pub type MakeTracker<'a> = dyn Fn() -> Result<Box<dyn TrackerUnderTest>, TrackerError> + Sync + 'a;
 

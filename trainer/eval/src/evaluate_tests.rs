@@ -49,6 +49,7 @@ fn store(folder: &Path, data: &Dataset, protocol: Protocol) -> ResultStore {
         tracker: "matcher".into(),
         model: "m".into(),
         engine: String::new(),
+        settings: String::new(),
         dataset: data.name.clone(),
         dataset_hash: crate::fingerprint::of_dataset(data),
         protocol: protocol.to_string(),

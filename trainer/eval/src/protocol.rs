@@ -18,7 +18,8 @@ pub enum Protocol {
     RgbToThermal,
     /// Template thermal, every later frame RGB: `t2rgb`.
     ThermalToRgb,
-    /// Template RGB, then thermal and RGB in turn, `every` frames each, thermal first: `switch:20`.
+    /// Template RGB, then thermal and RGB in turn, `every` frames each, thermal first: `switch:20`;
+    /// `switch` alone is [`Self::SWITCH`].
     Switch {
         /// Frames between switches, at least 1.
         every: usize,
@@ -30,9 +31,11 @@ pub enum Protocol {
 }
 
 impl Protocol {
+    /// Switch as the field runs it: every 200 frames.
+    pub const SWITCH: Self = Self::Switch { every: 200 };
+
     /// The three cross-modal protocols results are reported for.
-    pub const CROSS_MODAL: [Self; 3] =
-        [Self::RgbToThermal, Self::ThermalToRgb, Self::Switch { every: 20 }];
+    pub const CROSS_MODAL: [Self; 3] = [Self::RgbToThermal, Self::ThermalToRgb, Self::SWITCH];
 
     /// Sensor of frame `i`; frame 0 is the one the tracker is initialised with.
     pub const fn modality(self, i: usize) -> Modality {
@@ -74,7 +77,9 @@ impl fmt::Display for Protocol {
 
 /// A text that names no protocol.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("unknown protocol '{0}': expected rgb2t, t2rgb, switch:N (N at least 1), rgb or t")]
+#[error(
+    "unknown protocol '{0}': expected rgb2t, t2rgb, switch:N (N at least 1; switch is switch:200), rgb or t"
+)]
 pub struct UnknownProtocol(pub String);
 
 impl FromStr for Protocol {
@@ -87,6 +92,7 @@ impl FromStr for Protocol {
             "t2rgb" => Self::ThermalToRgb,
             "rgb" => Self::Rgb,
             "t" => Self::Thermal,
+            "switch" => Self::SWITCH,
             _ => match s.strip_prefix("switch:").and_then(|n| n.parse().ok()) {
                 Some(every) if every > 0 => Self::Switch { every },
                 _ => return Err(unknown()),

@@ -76,7 +76,8 @@ fn every_protocol_shows_its_sensors_and_reads_its_own_name() {
             assert!(protocol.needs().contains(&protocol.modality(i)));
         }
     }
-    for text in ["", "RGB2T", "switch", "switch:", "switch:0", "switch:-1", "switch:x", "t2t"] {
+    assert_eq!("switch".parse(), Ok(Protocol::Switch { every: 200 }));
+    for text in ["", "RGB2T", "switch:", "switch200", "switch:0", "switch:-1", "switch:x", "t2t"] {
         assert_eq!(text.parse::<Protocol>(), Err(UnknownProtocol(text.into())));
     }
 }

@@ -383,17 +383,27 @@ fn bell(bits: u64) -> f32 {
     (sum as f32 / 65536.0 - 2.0) * 1.732
 }
 
+/// What [`clips`] made of a pack of stills.
+#[derive(Debug, Default)]
+pub struct Clips {
+    /// One per target, in the order of the stills.
+    pub clips: Vec<PseudoClip>,
+    /// Stills that no clip can be made from: pictures that cannot be read or are no registered pair.
+    pub broken: Vec<PseudoError>,
+}
+
 /// One clip for every target of the stills that passes the size limits of `options`, in order.
-/// Stills without such a target are passed over and not decoded.
+/// Stills without such a target are passed over and not decoded; what is wrong with a still is
+/// listed and the others go on.
 ///
 /// # Errors
-/// When an option is out of range or a still cannot be decoded.
+/// When an option is out of range.
 pub fn clips<'a>(
     stills: impl IntoIterator<Item = &'a dyn Sequence>,
     options: PseudoOptions,
-) -> Result<Vec<PseudoClip>, PseudoError> {
+) -> Result<Clips, PseudoError> {
     options.validate()?;
-    let mut clips = Vec::new();
+    let mut made = Clips::default();
     for still in stills {
         let boxes: Vec<(usize, BBox)> = (0..still.targets())
             .filter_map(|n| Some((n, still.truth(n, 0, Modality::Rgb)?)))
@@ -402,15 +412,22 @@ pub fn clips<'a>(
         if boxes.is_empty() {
             continue;
         }
-        let still = Arc::new(RegisteredStill::decode(still)?);
+        let still = match RegisteredStill::decode(still) {
+            Ok(still) => Arc::new(still),
+            Err(e) => {
+                made.broken.push(e);
+                continue;
+            }
+        };
         let (width, height) = (still.rgb.width, still.rgb.height);
-        for (number, bbox) in boxes {
-            if options.takes(bbox, width, height) {
-                clips.push(PseudoClip::new(still.clone(), number, bbox, options)?);
+        for (number, bbox) in boxes.into_iter().filter(|(_, b)| options.takes(*b, width, height)) {
+            match PseudoClip::new(still.clone(), number, bbox, options) {
+                Ok(clip) => made.clips.push(clip),
+                Err(e) => made.broken.push(e),
             }
         }
     }
-    Ok(clips)
+    Ok(made)
 }
 
 #[cfg(test)]

@@ -29,6 +29,9 @@ pub struct RunSummary {
     pub bundle: String,
     /// The engine and its options.
     pub engine: String,
+    /// What the tracker was told beside that, such as the scan for a lost target.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub settings: String,
     /// Fingerprint of the dataset.
     pub dataset_hash: String,
     /// Sequences tracked at a time in the last run; frame rates depend on it.
@@ -54,6 +57,8 @@ pub struct RunContext {
     pub bundle: String,
     /// The engine and its options.
     pub engine: String,
+    /// What the tracker was told beside that.
+    pub settings: String,
     /// Fingerprint of the dataset.
     pub dataset_hash: String,
     /// Sequences tracked at a time.
@@ -170,6 +175,7 @@ pub fn sum_up(
         main,
         bundle: context.bundle,
         engine: context.engine,
+        settings: context.settings,
         dataset_hash: context.dataset_hash,
         jobs: context.jobs,
         failures: failed + context.broken.len(),

@@ -42,6 +42,9 @@ pub struct RunManifest {
     pub model: String,
     /// The engine and its options; empty for the baselines.
     pub engine: String,
+    /// What the tracker was told beside that; empty for a tracker as its bundle has it.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub settings: String,
     /// The dataset as it was named; for people, folders may move.
     pub dataset: String,
     /// Its [fingerprint](crate::fingerprint::of_dataset).
@@ -58,6 +61,7 @@ impl RunManifest {
             ("tracker", &self.tracker, &ours.tracker),
             ("bundle", &self.model, &ours.model),
             ("engine", &self.engine, &ours.engine),
+            ("settings", &self.settings, &ours.settings),
             ("dataset contents", &self.dataset_hash, &ours.dataset_hash),
             ("protocol", &self.protocol, &ours.protocol),
         ];
@@ -66,7 +70,10 @@ impl RunManifest {
         let others = fields.iter().filter(|(_, theirs, now)| theirs != now);
         let all: Vec<String> = version
             .into_iter()
-            .chain(others.map(|(what, theirs, now)| format!("{what} {theirs}, now {now}")))
+            .chain(others.map(|(what, theirs, now)| {
+                let [theirs, now] = [theirs, now].map(|v| if v.is_empty() { "none" } else { v });
+                format!("{what} {theirs}, now {now}")
+            }))
             .collect();
         (!all.is_empty()).then(|| all.join("; "))
     }

@@ -11,6 +11,7 @@ fn manifest() -> RunManifest {
         tracker: "t".into(),
         model: "00ff".into(),
         engine: "tract".into(),
+        settings: String::new(),
         dataset: "gtot:here".into(),
         dataset_hash: "abcd".into(),
         protocol: "rgb2t".into(),
@@ -32,6 +33,7 @@ fn results_of_another_run_are_refused() {
         (RunManifest { engine: "ort".into(), ..manifest() }, "engine tract, now ort"),
         (RunManifest { dataset_hash: "x".into(), ..manifest() }, "dataset contents abcd, now x"),
         (RunManifest { protocol: "rgb".into(), ..manifest() }, "protocol rgb2t, now rgb"),
+        (RunManifest { settings: "a=1".into(), ..manifest() }, "settings none, now a=1"),
         (RunManifest { program: "2".into(), ..manifest() }, "program version 1, now 2"),
         (RunManifest { version: 9, ..manifest() }, "version of the files 1, now 9"),
     ] {

@@ -19,7 +19,8 @@ use super::clip::ClipSequence;
 use super::layout::{Jobs, Layout, Side};
 use super::text::read_flags;
 use super::tree::{find_sequences, in_split, locate, name_of, select};
-use super::{BoxFormat, DatasetError, Note, Split};
+use super::{DatasetError, Note, Split};
+use crate::boxes::Layout as BoxLayout;
 
 /// Attribute codes in the order of the flags: no, partial, total occlusion, hyaline occlusion,
 /// motion blur, low and high illumination, abrupt illumination variation, low resolution,
@@ -34,17 +35,17 @@ const LAYOUT: Layout = Layout {
     rgb: Side {
         folders: &["visible"],
         files: &[
-            ("visible.txt", BoxFormat::Xywh),
-            ("init.txt", BoxFormat::Xywh),
-            ("infrared.txt", BoxFormat::Xywh),
+            ("visible.txt", BoxLayout::Xywh),
+            ("init.txt", BoxLayout::Xywh),
+            ("infrared.txt", BoxLayout::Xywh),
         ],
     },
     thermal: Side {
         folders: &["infrared"],
         files: &[
-            ("infrared.txt", BoxFormat::Xywh),
-            ("init.txt", BoxFormat::Xywh),
-            ("visible.txt", BoxFormat::Xywh),
+            ("infrared.txt", BoxLayout::Xywh),
+            ("init.txt", BoxLayout::Xywh),
+            ("visible.txt", BoxLayout::Xywh),
         ],
     },
     both: true,

@@ -7,7 +7,8 @@ use tsda_runtime::Modality;
 
 use super::clip::{ClipSequence, Labels, Parts, Pictures, Stream};
 use super::tree::{Listing, ids};
-use super::{BoxFormat, DatasetError, Note, Sequence, read_boxes};
+use super::{DatasetError, Note, Sequence, read_boxes};
+use crate::boxes::Layout as BoxLayout;
 
 /// Reads one sequence; made by a loader, run on any thread.
 pub(crate) type Job = Box<dyn FnOnce() -> Result<Box<dyn Sequence>, DatasetError> + Send>;
@@ -46,7 +47,7 @@ impl Jobs {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Side {
     pub(crate) folders: &'static [&'static str],
-    pub(crate) files: &'static [(&'static str, BoxFormat)],
+    pub(crate) files: &'static [(&'static str, BoxLayout)],
 }
 
 /// A layout of two such sides.

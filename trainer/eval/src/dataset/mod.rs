@@ -44,10 +44,12 @@ pub mod vtuav;
 pub use check::{CheckOptions, CheckReport, Decode, Finding, check};
 pub use clip::ClipSequence;
 pub use note::{Note, Severity};
-pub use open::{Dataset, KINDS, Kind, OpenError, Scan, Split, UnknownSplit, kind_of, open, scan};
+pub use open::{
+    Dataset, KINDS, Kind, OpenError, Scan, Split, UnknownSplit, kind_of, open, scan, scan_with,
+};
 pub use picture::{decode_picture, natural_cmp, picture_size};
 pub use registered::{Affine, Registration};
-pub use text::{BoxFormat, parse_boxes, read_boxes};
+pub use text::read_boxes;
 
 use std::path::PathBuf;
 

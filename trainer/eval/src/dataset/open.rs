@@ -7,7 +7,7 @@ use std::str::FromStr;
 use tsda_runtime::Modality;
 
 use super::layout::Jobs;
-use super::pairs::PairsDataset;
+use super::pairs::{self, PairsDataset};
 use super::{DatasetError, Sequence};
 use super::{antiuav, lasher, parallel, rgbt, sequences, single, stills, vtuav};
 use crate::pseudo::{self, PseudoError, PseudoOptions};
@@ -255,7 +255,7 @@ fn parse(text: &str) -> Result<Parsed<'_>, OpenError> {
     Ok(Parsed { kind, options, path: Path::new(path), split })
 }
 
-fn jobs(text: &str) -> Result<Jobs, OpenError> {
+fn jobs(text: &str, clips: PseudoOptions) -> Result<Jobs, OpenError> {
     let Parsed { kind, options, path, split } = parse(text)?;
     let on = |option: &str| options.contains(&option);
     let modality = if on("thermal") { Modality::Thermal } else { Modality::Rgb };
@@ -265,13 +265,22 @@ fn jobs(text: &str) -> Result<Jobs, OpenError> {
             Jobs { problems, ..Jobs::ready(pairs.into_pairs()) }
         }
         "pseudo" => {
-            let pairs = PairsDataset::open(path, split)?;
+            let (pairs, mut problems) = PairsDataset::scan(path, split)?;
             let stills = pairs.pairs().iter().map(|p| p as &dyn Sequence);
-            let clips = pseudo::clips(stills, PseudoOptions::default())?;
-            if clips.is_empty() {
+            let made = pseudo::clips(stills, clips)?;
+            problems.extend(made.broken.into_iter().map(|e| match e {
+                PseudoError::Dataset(e) => e,
+                // The text names the still.
+                e => DatasetError::Format {
+                    path: path.join(pairs::INDEX),
+                    line: None,
+                    reason: e.to_string(),
+                },
+            }));
+            if made.clips.is_empty() && problems.is_empty() {
                 return Err(OpenError::NoClips { text: text.to_owned() });
             }
-            Jobs::ready(clips)
+            Jobs { problems, ..Jobs::ready(made.clips) }
         }
         "sequences" => sequences::jobs(path, split)?,
         "stills" => stills::stills(path, split)?,
@@ -309,7 +318,15 @@ pub fn open(text: &str) -> Result<Dataset, OpenError> {
 /// # Errors
 /// When the text is wrong or there is nothing to look at.
 pub fn scan(text: &str) -> Result<Scan, OpenError> {
-    let Jobs { jobs, problems: mut broken } = jobs(text)?;
+    scan_with(text, PseudoOptions::default())
+}
+
+/// As [`scan`]; `clips` says how the clips of `pseudo` are made.
+///
+/// # Errors
+/// As [`scan`], and when such an option is out of range.
+pub fn scan_with(text: &str, clips: PseudoOptions) -> Result<Scan, OpenError> {
+    let Jobs { jobs, problems: mut broken } = jobs(text, clips)?;
     let mut sequences = Vec::with_capacity(jobs.len());
     for outcome in parallel::map(jobs, parallel::threads(), |job| job()) {
         match outcome {

@@ -19,10 +19,11 @@ use super::clip::ClipSequence;
 use super::layout::{Jobs, Layout, Side};
 use super::text::{read_flags, read_names};
 use super::tree::{Listing, find_sequences, locate, name_of};
-use super::{BoxFormat, DatasetError, Split};
+use super::{DatasetError, Split};
+use crate::boxes::Layout as BoxLayout;
 
-const XYWH: BoxFormat = BoxFormat::Xywh;
-const CORNERS: BoxFormat = BoxFormat::Corners;
+const XYWH: BoxLayout = BoxLayout::Xywh;
+const CORNERS: BoxLayout = BoxLayout::GTOT;
 
 const RGBT234: Layout = Layout {
     rgb: Side { folders: &["visible"], files: &[("visible.txt", XYWH), ("init.txt", XYWH)] },

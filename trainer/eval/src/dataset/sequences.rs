@@ -20,23 +20,24 @@ use serde_json::Value;
 
 use super::layout::{Jobs, Layout, Side};
 use super::tree::{Listing, find_sequences, name_of};
-use super::{BoxFormat, ClipSequence, DatasetError, Sequence, Split};
+use super::{ClipSequence, DatasetError, Sequence, Split};
+use crate::boxes::Layout as BoxLayout;
 
 const LAYOUT: Layout = Layout {
     rgb: Side {
         folders: &["visible"],
         files: &[
-            ("visible.txt", BoxFormat::Xywh),
-            ("infrared.txt", BoxFormat::Xywh),
-            ("init.txt", BoxFormat::Xywh),
+            ("visible.txt", BoxLayout::Xywh),
+            ("infrared.txt", BoxLayout::Xywh),
+            ("init.txt", BoxLayout::Xywh),
         ],
     },
     thermal: Side {
         folders: &["infrared"],
         files: &[
-            ("infrared.txt", BoxFormat::Xywh),
-            ("visible.txt", BoxFormat::Xywh),
-            ("init.txt", BoxFormat::Xywh),
+            ("infrared.txt", BoxLayout::Xywh),
+            ("visible.txt", BoxLayout::Xywh),
+            ("init.txt", BoxLayout::Xywh),
         ],
     },
     both: false,

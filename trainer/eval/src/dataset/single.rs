@@ -21,7 +21,8 @@ use super::clip::{ClipSequence, Labels, Parts, Pictures, Stream};
 use super::layout::Jobs;
 use super::text::{read_flags, read_numbers};
 use super::tree::{Listing, find_sequences, in_split, select};
-use super::{BoxFormat, DatasetError, Note, Split, read_boxes};
+use super::{DatasetError, Note, Split, read_boxes};
+use crate::boxes::Layout as BoxLayout;
 
 /// OTB clips whose first row does not belong to their first picture, with the number of the picture
 /// it belongs to.
@@ -67,7 +68,7 @@ pub(crate) fn otb(
         };
         let mut labels = Vec::new();
         for path in otb_files(&listing) {
-            let mut rows = read_boxes(&path, BoxFormat::Xywh)?;
+            let mut rows = read_boxes(&path, BoxLayout::Xywh)?;
             if !zero_based {
                 for b in rows.iter_mut().filter(|b| b.is_valid()) {
                     *b = BBox::new(b.x - 1.0, b.y - 1.0, b.w, b.h);
@@ -142,7 +143,7 @@ fn read_got10k(
     let pictures = Pictures::of(dir, listing.pictures())?;
     let mut notes = Vec::new();
     let truth = dir.join("groundtruth.txt");
-    let mut labels = Labels::of(&truth, read_boxes(&truth, BoxFormat::Xywh)?);
+    let mut labels = Labels::of(&truth, read_boxes(&truth, BoxLayout::Xywh)?);
     labels.partial = labels.rows.len() == 1;
     let rows = labels.rows.len();
     // A flag per row; a file of another length cannot be trusted row by row.

@@ -20,14 +20,15 @@ use std::sync::Arc;
 use super::clip::{ClipSequence, Labels, Stream};
 use super::layout::{Jobs, Layout, Side};
 use super::tree::{find_sequences, in_split, locate, name_of, select, split_of};
-use super::{BoxFormat, DatasetError, Note, Split};
+use super::{DatasetError, Note, Split};
+use crate::boxes::Layout as BoxLayout;
 
 /// Frames from annotated row to row.
 pub const EVERY: usize = 10;
 
 const LAYOUT: Layout = Layout {
-    rgb: Side { folders: &["rgb"], files: &[("rgb.txt", BoxFormat::Xywh)] },
-    thermal: Side { folders: &["ir", "ir_gray"], files: &[("ir.txt", BoxFormat::Xywh)] },
+    rgb: Side { folders: &["rgb"], files: &[("rgb.txt", BoxLayout::Xywh)] },
+    thermal: Side { folders: &["ir", "ir_gray"], files: &[("ir.txt", BoxLayout::Xywh)] },
     both: true,
     what: "rgb/ nor ir/",
 };
