@@ -13,7 +13,7 @@ pub struct RedetectArgs {
     #[arg(long, value_name = "N", num_args = 0..=1, require_equals = true,
         default_missing_value = "2", value_parser = clap::value_parser!(u8).range(1..))]
     pub scan_when_lost: Option<u8>,
-    /// Score above which a find of the scan counts [default: 0.7]
+    /// Score above which a find of the scan counts [default: 0.8]
     #[arg(long, value_name = "SCORE", requires = "scan_when_lost")]
     pub scan_threshold: Option<f32>,
 }
@@ -78,16 +78,16 @@ mod tests {
         };
         assert_eq!(parse(&[]).expect("nothing"), None);
         assert_eq!(parse(&["--scan-when-lost"]).expect("alone"), Some(RedetectOptions::default()));
-        let both = parse(&["--scan-when-lost=5", "--scan-threshold", "0.8"]).expect("both");
-        assert_eq!(both, Some(RedetectOptions { positions_per_frame: 5, threshold: 0.8 }));
+        let both = parse(&["--scan-when-lost=5", "--scan-threshold", "0.9"]).expect("both");
+        assert_eq!(both, Some(RedetectOptions { positions_per_frame: 5, threshold: 0.9 }));
         let text = |args: &[&str]| {
             let args = ["program"].iter().chain(args);
             Program::try_parse_from(args).map(|p| p.redetect.to_string()).expect("arguments")
         };
         assert_eq!(text(&[]), "");
         assert_eq!(
-            text(&["--scan-when-lost=5", "--scan-threshold", "0.8"]),
-            "scan {\"positions_per_frame\":5,\"threshold\":0.8}"
+            text(&["--scan-when-lost=5", "--scan-threshold", "0.9"]),
+            "scan {\"positions_per_frame\":5,\"threshold\":0.9}"
         );
         assert!(parse(&["--scan-threshold", "0.8"]).is_err());
         assert!(parse(&["--scan-when-lost=0"]).is_err());

@@ -28,7 +28,8 @@ fn the_scan_finds_a_target_that_comes_out_elsewhere() {
         rows[0].clone()
     };
     let without = figures(&[]);
-    let with = figures(&["--scan-when-lost"]);
+    // Below the default, at which this clip's target stays lost (docs/results/confidence.md).
+    let with = figures(&["--scan-when-lost", "--scan-threshold", "0.7"]);
     assert_eq!(without["redetected"]["changes"], 1);
     assert_eq!((&without["redetected"]["came"], &without["found_by_scan"]), (&0.into(), &0.into()));
     assert_eq!((&with["redetected"]["came"], &with["found_by_scan"]), (&1.into(), &1.into()));

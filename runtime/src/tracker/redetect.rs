@@ -26,7 +26,7 @@ pub struct RedetectOptions {
 
 impl Default for RedetectOptions {
     fn default() -> Self {
-        Self { positions_per_frame: 2, threshold: 0.7 }
+        Self { positions_per_frame: 2, threshold: 0.8 }
     }
 }
 

@@ -93,23 +93,74 @@ impl FrameErrors {
     }
 }
 
-/// Overlap of two boxes as the VOT toolkit counts it: both are set on the pixel grid (position and
-/// size rounded), cut to the picture (without a size: to non-negative coordinates), and their
-/// pixels compared. 0 for boxes without pixels or with NaN.
+/// Overlap of two boxes as the VOT toolkit counts it (0.7.4 and 0.9.0 alike): sides are rounded to
+/// whole pixels, the pixels of both are drawn into the smallest canvas that holds them, cut to the
+/// picture where its size is given, and counted. 0 for NaN, and where no pixel is drawn.
+///
+/// Two of its habits are kept, because published figures contain them:
+///
+/// - a canvas that is one pixel wide or high counts as two empty regions, which agree: 1; when only
+///   cutting made it so, 0;
+/// - without a picture, a canvas that begins left of or above 0 loses as many pixels on its far side:
+///   boxes are drawn up to the canvas's last *coordinate*, taken for an index. One that ends below
+///   0, too, counts that index from the far side.
 pub fn vot_overlap(truth: Row, predicted: Row, image: Option<(u32, u32)>) -> f64 {
     if truth.iter().chain(&predicted).any(|v| !v.is_finite()) {
         return 0.0;
     }
-    let (width, height) =
-        image.map_or((f64::INFINITY, f64::INFINITY), |(w, h)| (f64::from(w), f64::from(h)));
-    let cut = |r: Row| {
-        let r = r.map(f64::round_ties_even);
-        let (x, y) = (r[0].clamp(0.0, width), r[1].clamp(0.0, height));
-        [x, y, (r[0] + r[2]).clamp(x, width.max(x)), (r[1] + r[3]).clamp(y, height.max(y))]
+    // Single precision decides which way a side of almost half a pixel is rounded.
+    let boxes = [truth, predicted].map(|r| r.map(|v| f64::from((v as f32).round_ties_even())));
+    let axis = |first: usize, image: Option<u32>| {
+        Canvas::new(boxes.map(|r| [r[first], r[first + 2]]), image.map(f64::from))
     };
-    let area = |r: Row| (r[2] - r[0]).max(0.0) * (r[3] - r[1]).max(0.0);
-    let (a, b) = (cut(truth), cut(predicted));
-    let inter = area([a[0].max(b[0]), a[1].max(b[1]), a[2].min(b[2]), a[3].min(b[3])]);
-    let union = area(a) + area(b) - inter;
+    let (x, y) = (axis(0, image.map(|i| i.0)), axis(1, image.map(|i| i.1)));
+    if x.thin || y.thin {
+        return 1.0;
+    }
+    if x.thin_after_cut || y.thin_after_cut {
+        return 0.0;
+    }
+    let area = |i: usize| length(x.spans[i]) * length(y.spans[i]);
+    let inter = length(common(x.spans)) * length(common(y.spans));
+    let union = area(0) + area(1) - inter;
     if union > 0.0 { inter / union } else { 0.0 }
+}
+
+/// One axis of the VOT toolkit's canvas: where two boxes are drawn on it.
+struct Canvas {
+    /// First pixel drawn and first one after them, counted from the canvas's first.
+    spans: [[f64; 2]; 2],
+    /// Not more than one pixel.
+    thin: bool,
+    thin_after_cut: bool,
+}
+
+impl Canvas {
+    /// For whole `[start, length]` of both boxes and the picture's length.
+    fn new(boxes: [[f64; 2]; 2], image: Option<f64>) -> Self {
+        let last = |[start, length]: [f64; 2]| start + length - 1.0;
+        let (low, high) = (boxes[0][0].min(boxes[1][0]), last(boxes[0]).max(last(boxes[1])));
+        let thin = low >= high;
+        let (low, high) = image.map_or((low, high), |image| (low.max(0.0), high.min(image - 1.0)));
+        let size = high - low + 1.0;
+        let span = |b: [f64; 2]| {
+            let start = (b[0] - low).max(0.0);
+            let mut end = (last(b) - low).min(high) + 1.0;
+            if low < 0.0 && end < 0.0 {
+                end += size;
+            }
+            // What ends before the canvas is not drawn, and gets no pixels by the wrapped index.
+            let end = if last(b) < low { start } else { end.min(size) };
+            [start, end]
+        };
+        Self { spans: boxes.map(span), thin, thin_after_cut: low >= high }
+    }
+}
+
+fn length([start, end]: [f64; 2]) -> f64 {
+    (end - start).max(0.0)
+}
+
+fn common([a, b]: [[f64; 2]; 2]) -> [f64; 2] {
+    [a[0].max(b[0]), a[1].min(b[1])]
 }
