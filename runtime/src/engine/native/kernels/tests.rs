@@ -118,6 +118,7 @@ proptest! {
                 clamp: if with == 3 { (0.0, 6.0) } else { (f32::NEG_INFINITY, f32::INFINITY) },
                 halo: (halo > 0).then_some(border),
                 block: 1 + gap * 8,
+                scales: None,
             });
             (step, weights)
         };
