@@ -310,11 +310,8 @@ impl Gemm {
     }
 
     const fn tiles<'k>(&self, k: &'k Kernels) -> Tiles<'k> {
-        let (rows, of) = if self.scales.is_some() {
-            (k.eight.rows, &k.eight.tiles)
-        } else {
-            (k.rows, &k.tiles)
-        };
+        let (rows, of) =
+            if self.scales.is_some() { (k.eight.rows, &k.eight.tiles) } else { (k.rows, &k.tiles) };
         Tiles { rows, packing: self.packing(k), of }
     }
 

@@ -3,8 +3,8 @@
 use super::attention::Attention;
 use super::eight::BYTES;
 use super::{
-    Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem, PackKv,
-    Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
+    Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem,
+    PackKv, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
 };
 use crate::engine::native::sync::Barrier;
 

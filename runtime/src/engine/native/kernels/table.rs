@@ -261,3 +261,19 @@ table!(@eight NEON_DOTPROD, neon_dotprod, neon::DotProd, 8, ("neon,dotprod"));
 table!(NEON, neon_table, neon::Neon, 8, ("neon"), NEON_WIDE);
 #[cfg(target_arch = "aarch64")]
 static NEON_DOT: Kernels = Kernels { eight: NEON_DOTPROD, ..neon_table::TABLE };
+
+/// Tables of this processor that [`Isa::kernels`] passes over because it has a better one.
+#[cfg(test)]
+pub fn passed_over() -> Vec<(String, &'static Kernels)> {
+    let mut found: Vec<(String, &'static Kernels)> = Vec::new();
+    #[cfg(target_arch = "x86_64")]
+    if Isa::Avx2.kernels().is_some() {
+        found.push(("Avx2 without VNNI".into(), &AVX2));
+        if Isa::Avx512.kernels().is_some() {
+            found.push(("Avx512 without VNNI".into(), &AVX512));
+        }
+    }
+    #[cfg(target_arch = "aarch64")]
+    found.push(("Neon without dotprod".into(), &NEON));
+    found
+}

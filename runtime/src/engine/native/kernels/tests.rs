@@ -1,6 +1,8 @@
 //! Every kernel, with every instruction set of this processor and several threads, against loops
 //! written out, over odd sizes, strides and alignments.
 
+mod eight;
+
 use super::*;
 use crate::engine::native::graph::{Binary, Reduce, Unary};
 use proptest::prelude::*;

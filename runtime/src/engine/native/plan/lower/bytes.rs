@@ -170,7 +170,8 @@ impl Lower<'_, '_, '_> {
             [_, _] => 1,
             _ => return None,
         };
-        let weights = Weights { bytes, scale, shape, from: super::super::source(self.index, id, data) };
+        let weights =
+            Weights { bytes, scale, shape, from: super::super::source(self.index, id, data) };
         let fits = scale.len() == 1 || (scale.len() == weights.columns() && *inner == along);
         fits.then_some(weights)
     }
@@ -230,8 +231,7 @@ impl Lower<'_, '_, '_> {
         Ok(Operands {
             weights: self.planner.make(made, || packed),
             bias: Some(
-                self.planner
-                    .make(Made::Offsets(from, bias_from, step, input.zero), || offsets),
+                self.planner.make(Made::Offsets(from, bias_from, step, input.zero), || offsets),
             ),
             scales: Some(self.planner.make(Made::Scales(from, step), || factors)),
         })
@@ -246,8 +246,7 @@ mod tests {
     fn weights_are_found_where_they_lie() {
         let bytes: Vec<u8> = (0..24).collect();
         let from = Source::Bytes(0, 0);
-        let kernel =
-            Weights { bytes: &bytes, scale: &[1.0], shape: vec![2, 3, 2, 2], from };
+        let kernel = Weights { bytes: &bytes, scale: &[1.0], shape: vec![2, 3, 2, 2], from };
         assert_eq!((kernel.columns(), kernel.rows()), (2, (4, 3)));
         assert_eq!(kernel.at(3, 2, 1), 23);
         assert_eq!(kernel.at(1, 0, 1), 13);
