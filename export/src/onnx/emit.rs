@@ -60,7 +60,7 @@ impl WeightStore {
         let mut hasher = DefaultHasher::new();
         raw.hash(&mut hasher);
         let places = self.places.entry(hasher.finish()).or_default();
-        let held = places.iter().find(|(at, len)| self.bytes[*at..*at + *len] == raw);
+        let held = places.iter().find(|(at, len)| self.bytes[*at..*at + *len] == *raw);
         if let Some(place) = held {
             return *place;
         }

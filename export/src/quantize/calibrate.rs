@@ -7,7 +7,7 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::rc::Rc;
 use tsda_eval::dataset::Dataset;
-use tsda_eval::protocol::Protocol;
+use tsda_eval::protocol::{Protocol, TrackerError, TrackerUnderTest as _};
 use tsda_runtime::bundle::{Bundle, SectionKind};
 use tsda_runtime::engine::native::{GraphSession, Isa};
 use tsda_runtime::engine::{Engine, EngineError, Maps, Stage, TemplateInput};
@@ -295,10 +295,10 @@ pub fn ranges(
     let mut runners = Vec::with_capacity(2);
     for params in [deployed, eager] {
         let engine = Watching::new(bundle, files, products, seen.clone())?;
-        let tracker = Tracker::new(engine, params).map_err(|source| QuantizeError::Track {
+        let tracker = Tracker::new(engine, params).map_err(|e| QuantizeError::Track {
             sequence: data.name.clone(),
             frame: 0,
-            source,
+            source: TrackerError::new(e),
         })?;
         runners.push(Runner::new(tracker));
     }
@@ -355,9 +355,9 @@ fn track(
             let picture =
                 sequence.picture(start + i, modality).map_err(|e| unusable(&e.to_string()))?;
             let done = if i == 0 {
-                runner.start(&picture, bbox, modality)
+                runner.init(&picture, bbox, modality)
             } else {
-                runner.follow(&picture, modality).map(|_| ())
+                runner.update(&picture, modality).map(|_| ())
             };
             done.map_err(|source| QuantizeError::Track {
                 sequence: sequence.id().into(),

@@ -8,7 +8,7 @@ use tsda_eval::protocol::{Protocol, TrackerError, TrackerUnderTest};
 use tsda_eval::summary::ProtocolSummary;
 use tsda_runtime::bundle::Bundle;
 use tsda_runtime::engine::NativeEngine;
-use tsda_runtime::{BBox, Engine, Modality, TrackError, Tracker};
+use tsda_runtime::{BBox, Engine, Modality, Tracker};
 
 /// A tracker that follows changes of the picture's size, as the programs do: both sensors are taken
 /// to see the same field of view.
@@ -22,25 +22,6 @@ impl<E: Engine> Runner<E> {
     pub fn new(tracker: Tracker<E>) -> Self {
         Self { tracker, size: (0, 0), last: BBox::default() }
     }
-
-    pub fn start(&mut self, p: &Picture, bbox: BBox, modality: Modality) -> Result<(), TrackError> {
-        self.size = (p.width, p.height);
-        self.last = bbox;
-        self.tracker.init(&p.view()?, bbox, Some(modality))
-    }
-
-    pub fn follow(&mut self, p: &Picture, modality: Modality) -> Result<(BBox, f32), TrackError> {
-        let now = (p.width, p.height);
-        if now != self.size {
-            let (kx, ky) = (now.0 as f32 / self.size.0 as f32, now.1 as f32 / self.size.1 as f32);
-            let b = self.last;
-            self.tracker.set_box(BBox::new(b.x * kx, b.y * ky, b.w * kx, b.h * ky))?;
-            self.size = now;
-        }
-        let track = self.tracker.update(&p.view()?, Some(modality))?;
-        self.last = track.bbox;
-        Ok((track.bbox, track.score))
-    }
 }
 
 impl<E: Engine> TrackerUnderTest for Runner<E> {
@@ -49,11 +30,25 @@ impl<E: Engine> TrackerUnderTest for Runner<E> {
     }
 
     fn init(&mut self, p: &Picture, bbox: BBox, modality: Modality) -> Result<(), TrackerError> {
-        self.start(p, bbox, modality).map_err(TrackerError::new)
+        let view = p.view().map_err(TrackerError::new)?;
+        self.size = (p.width, p.height);
+        self.last = bbox;
+        self.tracker.init(&view, bbox, Some(modality)).map_err(TrackerError::new)
     }
 
     fn update(&mut self, p: &Picture, modality: Modality) -> Result<(BBox, f32), TrackerError> {
-        self.follow(p, modality).map_err(TrackerError::new)
+        let view = p.view().map_err(TrackerError::new)?;
+        let now = (p.width, p.height);
+        if now != self.size {
+            let (kx, ky) = (now.0 as f32 / self.size.0 as f32, now.1 as f32 / self.size.1 as f32);
+            let b = self.last;
+            let scaled = BBox::new(b.x * kx, b.y * ky, b.w * kx, b.h * ky);
+            self.tracker.set_box(scaled).map_err(TrackerError::new)?;
+            self.size = now;
+        }
+        let track = self.tracker.update(&view, Some(modality)).map_err(TrackerError::new)?;
+        self.last = track.bbox;
+        Ok((track.bbox, track.score))
     }
 }
 

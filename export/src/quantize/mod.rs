@@ -23,13 +23,13 @@ use graph::{File, Product};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use tsda_eval::dataset::Dataset;
-use tsda_eval::protocol::EvalError;
+use tsda_eval::protocol::{EvalError, TrackerError};
+use tsda_runtime::EngineError;
 use tsda_runtime::bundle::{
     Bundle, BundleError, Loss, Manifest, Numbers, Precision, SectionKind, crc32,
 };
 use tsda_runtime::engine::NativeEngine;
 use tsda_runtime::probe::{self, Probe, ProbeError};
-use tsda_runtime::{EngineError, TrackError};
 
 /// A bundle that cannot be made narrower.
 #[derive(Debug, thiserror::Error)]
@@ -96,7 +96,7 @@ pub enum QuantizeError {
         /// Its frame.
         frame: usize,
         /// Why.
-        source: TrackError,
+        source: TrackerError,
     },
     /// The evaluation failed.
     #[error(transparent)]
@@ -300,8 +300,10 @@ pub fn quantize_on(
         data: if bytes { &calibration } else { "" },
         frames: frames as u32,
         from_crc: crc32(weights),
-        losses: heapless::Vec::new(),
+        losses: Default::default(),
     };
+    // Declared before the manifest that will point into it.
+    let mut losses: Vec<LossReport> = Vec::new();
     let mut narrow = Manifest { precision: Some(precision), ..manifest.clone() };
 
     // What the other engines are compared with is computed by the network as it is now.
@@ -316,7 +318,6 @@ pub fn quantize_on(
     sections.pop();
     sections.push((SectionKind::Probe, own));
 
-    let mut losses = Vec::new();
     if !measure.is_empty() {
         let draft = bundle::encode(&narrow, &sections)?;
         let pair = [bundle, &Bundle::parse(&draft)?];
