@@ -12,7 +12,7 @@ use tsda_runtime::bundle::{
 use tsda_runtime::engine::native::Isa;
 use tsda_runtime::engine::{EngineChoice, NativeEngine, NativeOptions};
 use tsda_runtime::probe::{self, Probe};
-use tsda_runtime::{BBox, Backbone, FrameView, Modality, ModelSpec, Tracker, TrackerParams};
+use tsda_runtime::{Backbone, FrameView, Modality, ModelSpec, Tracker, TrackerParams};
 use tsda_trainer::burn_engine::BurnEngine;
 
 fn small() -> ModelSpec {
@@ -133,7 +133,7 @@ fn what_cannot_be_made_narrow_is_told() {
     let error = quantize(&bundle, &missing, &mut quiet).unwrap_err().to_string();
     assert!(error.contains("not/there"), "{error}");
     let data = clips();
-    let mut on = |bundle: &Bundle<'_>, options: &QuantizeOptions| {
+    let on = |bundle: &Bundle<'_>, options: &QuantizeOptions| {
         let calib = Some(("clips".to_owned(), &data));
         quantize_on(bundle, options, calib, &[], &mut |_| {}).map(|r| r.0)
     };

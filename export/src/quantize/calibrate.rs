@@ -29,6 +29,9 @@ pub struct Rounding {
     pub zero: u8,
 }
 
+/// Of every input of a product that becomes one of bytes, by index of its graph and name.
+pub type Roundings = BTreeMap<(usize, String), Rounding>;
+
 /// How often values occur. Zeros are left out: they cost nothing.
 #[derive(Clone, Debug)]
 pub struct Histogram {
@@ -288,7 +291,7 @@ pub fn ranges(
     products: &[Product],
     data: &Dataset,
     frames: usize,
-) -> Result<(BTreeMap<(usize, String), Rounding>, usize), QuantizeError> {
+) -> Result<(Roundings, usize), QuantizeError> {
     let seen = Rc::new(RefCell::new(Seen::new()));
     let deployed = bundle.manifest().tracker;
     let eager = TrackerParams { not_found: 0.0, write_confidence: 0.0, ..deployed };
@@ -304,7 +307,7 @@ pub fn ranges(
     }
     let tracked = track(&mut runners, data, frames)?;
     let seen = seen.borrow();
-    let mut roundings = BTreeMap::new();
+    let mut roundings = Roundings::new();
     for product in products.iter().filter(|p| p.kept.is_none()) {
         let kind = files[product.file].kind;
         let key = (product.file, product.input.clone());

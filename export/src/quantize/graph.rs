@@ -1,7 +1,7 @@
 //! Which products become products of bytes, and the ONNX files that say so.
 
 use super::QuantizeError;
-use super::calibrate::Rounding;
+use super::calibrate::{Rounding, Roundings};
 use crate::onnx::proto::*;
 use crate::onnx::{WeightStore, macs};
 use prost::Message as _;
@@ -225,7 +225,7 @@ pub fn write(
     files: &[File],
     weights: &[u8],
     products: &[Product],
-    roundings: &BTreeMap<(usize, String), Rounding>,
+    roundings: &Roundings,
     half: bool,
 ) -> Result<Vec<(SectionKind, Vec<u8>)>, QuantizeError> {
     let mut store = WeightStore::new(WEIGHTS_FILE);

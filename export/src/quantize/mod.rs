@@ -18,10 +18,9 @@ mod tests;
 
 use crate::bundle::{self, WriteError};
 use crate::onnx::macs::ShapeError;
-use calibrate::Rounding;
+use calibrate::Roundings;
 use graph::{File, Product};
 use serde::Serialize;
-use std::collections::BTreeMap;
 use tsda_eval::dataset::Dataset;
 use tsda_eval::protocol::{EvalError, TrackerError};
 use tsda_runtime::EngineError;
@@ -217,7 +216,7 @@ impl std::fmt::Display for QuantizeReport {
             }
         }
         let [scores, ltrb] = self.probe;
-        writeln!(f, "probe: score map off by up to {scores:.4}, ltrb map by {ltrb:.4}")?;
+        writeln!(f, "probe: score map off by up to {scores:.1e}, ltrb map by {ltrb:.1e}")?;
         for LossReport { name, before, after } in &self.losses {
             writeln!(f, "{name:<44} {before:>7.2} -> {after:>7.2} ({:+.2})", after - before)?;
         }
@@ -286,7 +285,7 @@ pub fn quantize_on(
             calibrate::ranges(bundle, &files, &products, data, options.frames)?
         }
         (None, true) => return Err(QuantizeError::NoData),
-        (_, false) => (BTreeMap::new(), 0),
+        (_, false) => (Roundings::new(), 0),
     };
     let half = matches!(options.numbers, Numbers::Half | Numbers::Int8Half);
     let mut sections = graph::write(&files, weights, &products, &roundings, half)?;
@@ -344,11 +343,7 @@ pub fn quantize_on(
     Ok((out, report))
 }
 
-fn layer(
-    files: &[File],
-    product: &Product,
-    roundings: &BTreeMap<(usize, String), Rounding>,
-) -> LayerReport {
+fn layer(files: &[File], product: &Product, roundings: &Roundings) -> LayerReport {
     let rounding = match product.kept {
         None => roundings.get(&(product.file, product.input.clone())),
         Some(_) => None,
