@@ -254,6 +254,7 @@ pub fn build(options: &BuildOptions) -> Result<BuildReport, BuildError> {
         licence: &options.licence,
         card: &card,
         sections: Default::default(),
+        precision: None,
     };
     let bundle = bundle::write(&options.out, &manifest, &sections)?;
     Ok(BuildReport {

@@ -6,7 +6,8 @@
 //!    ([`bundle`]).
 //! 4. [`check`] compares every engine with the reference outputs; [`unpack`] takes a bundle apart;
 //!    [`macs`] counts what it computes.
-//! 5. [`golden`] compares every back end with reference figures of the network.
+//! 5. [`quantize`] makes bundles of 8-bit numbers and 16-bit weights out of bundles of floats.
+//! 6. [`golden`] compares every back end with reference figures of the network.
 //!
 //! The command line is `tsda-export` (`src/main.rs`).
 
@@ -18,4 +19,5 @@ pub mod golden;
 pub mod macs;
 pub mod network;
 pub mod onnx;
+pub mod quantize;
 pub mod unpack;

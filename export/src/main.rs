@@ -1,4 +1,4 @@
-//! `tsda-export`: build, check and unpack bundles, count what they compute, compare back ends with
+//! `tsda-export`: build, narrow, check and unpack bundles, count what they compute, compare back ends with
 //! golden figures.
 //!
 //! Exit codes: 0 done; 1 an engine differs by more than the tolerance; 2 bad input, or an engine
@@ -6,6 +6,8 @@
 
 #[path = "golden_cli.rs"]
 mod golden;
+#[path = "quantize_cli.rs"]
+mod quantize_cli;
 
 use anyhow::Context as _;
 use clap::{Parser, Subcommand, ValueEnum};
@@ -15,9 +17,10 @@ use tsda_export::build::{BuildOptions, build};
 use tsda_export::check::check_on;
 use tsda_export::macs::{self, MacsReport};
 use tsda_export::network;
+use tsda_export::quantize::QuantizeOptions;
 use tsda_export::unpack::unpack;
 use tsda_runtime::ModelSpec;
-use tsda_runtime::bundle::{BundleFile, TrainedOn};
+use tsda_runtime::bundle::{BundleFile, Numbers, TrainedOn};
 use tsda_runtime::engine::EngineChoice;
 
 /// Turns trained weights into bundles that run on a board, and checks them.
@@ -63,19 +66,24 @@ enum Command {
         /// Licence of the weights.
         #[arg(long, default_value = "see the model card")]
         licence: String,
+        /// Stores weights as 16-bit floats; they are expanded when the bundle is loaded.
+        #[arg(long)]
+        weights_f16: bool,
     },
     /// Compares every engine compiled in with the outputs of the trainer's network.
     Check {
         /// The bundle.
         bundle: PathBuf,
-        /// Largest absolute difference allowed.
-        #[arg(long, default_value_t = 1e-4, value_parser = tolerance)]
-        tolerance: f32,
+        /// Largest absolute difference allowed [default: 1e-4, for bundles of 8 bits 5e-2].
+        #[arg(long, value_parser = tolerance)]
+        tolerance: Option<f32>,
         /// Only this engine: native, tract, ort, ort:cuda, ort:tensorrt (docs/engines.md) [default: every
         /// one of this build that is on the machine].
         #[arg(long)]
         engine: Option<EngineChoice>,
     },
+    /// Makes a bundle of 8-bit numbers, or of 16-bit weights, out of one of floats.
+    Quantize(quantize_cli::QuantizeArgs),
     /// Compares back ends with golden figures of the network, tensor by tensor.
     Golden(golden::GoldenArgs),
     /// Writes the parts of a bundle as plain files: ONNX graphs, weights, manifest, card.
@@ -146,6 +154,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
             figures,
             data_sources,
             licence,
+            weights_f16,
         } => {
             let trained_on = TrainedOn {
                 rgb: trained_on.contains(&Sensor::Rgb),
@@ -176,11 +185,16 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
                 "weights.bin", report.weights, report.parameters
             );
             println!("{}: {} bytes", options.out.display(), report.bundle);
+            if weights_f16 {
+                let half = QuantizeOptions { numbers: Numbers::Half, ..Default::default() };
+                print!("{}", quantize_cli::rewrite(&options.out, &options.out, &half)?);
+            }
             Ok(ExitCode::SUCCESS)
         }
         Command::Check { bundle, tolerance, engine } => {
             let file = BundleFile::open(&bundle)?;
             let named = || format!("{}", bundle.display());
+            let tolerance = tolerance.unwrap_or(file.bundle()?.manifest().probe_tolerance());
             let report = check_on(&file.bundle()?, engine.as_ref()).with_context(named)?;
             print!("{report}");
             if let Some(unchecked) = report.failure() {
@@ -195,6 +209,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
             Ok(ExitCode::FAILURE)
         }
         Command::Golden(args) => golden::run(&args),
+        Command::Quantize(args) => quantize_cli::run(&args),
         Command::Unpack { bundle, dir } => {
             let file = BundleFile::open(&bundle)?;
             for path in unpack(&file.bundle()?, &dir)? {

@@ -56,6 +56,7 @@ fn random_bundle(name: &str, spec: &ModelSpec) -> (Vec<u8>, usize) {
         licence: "none",
         card: "# Random",
         sections: Default::default(),
+        precision: None,
     };
     (bundle::encode(&manifest, &sections).unwrap(), network::parameters(&net))
 }
@@ -357,6 +358,7 @@ fn the_written_bundle_reads_back() {
             licence: "MIT",
             card,
             sections: Default::default(),
+            precision: None,
         };
         let bytes = bundle::encode(&manifest, &sections).unwrap();
         let read = Bundle::parse(&bytes).unwrap();
@@ -383,6 +385,7 @@ fn empty() -> Manifest<'static> {
         licence: "",
         card: "",
         sections: Default::default(),
+        precision: None,
     }
 }
 

@@ -225,6 +225,7 @@ fn either_form_of_slot_runs_in_the_engine() {
             licence: "none",
             card: "",
             sections: Default::default(),
+            precision: None,
         };
         let bytes = bundle::encode(&manifest, &sections).unwrap();
         let bundle = Bundle::parse(&bytes).unwrap();

@@ -95,7 +95,12 @@ pub(crate) fn localise_weighted(
     };
     let first = peak(scores, side, |row, col| Some(weight(row, col)));
     if plain(first).score < params.not_found {
-        return Located { flag: Flag::NotFound, cell: first.cell, first: plain(first), second: None };
+        return Located {
+            flag: Flag::NotFound,
+            cell: first.cell,
+            first: plain(first),
+            second: None,
+        };
     }
     let rows = block(first.cell.row, params.neighbourhood * target.y, side);
     let cols = block(first.cell.col, params.neighbourhood * target.x, side);

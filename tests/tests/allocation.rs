@@ -2,10 +2,13 @@
 //! library does inside is counted apart and printed, per engine. Only Rust's allocator is counted:
 //! what ONNX Runtime takes from C++'s is not seen.
 
+mod synthetic;
+
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
-use tsda_runtime::bundle::BundleFile;
-use tsda_runtime::engine::{EngineChoice, Maps, TemplateInput};
+use tsda_export::quantize::{QuantizeOptions, quantize_on};
+use tsda_runtime::bundle::{Bundle, BundleFile};
+use tsda_runtime::engine::{EngineChoice, Maps, NativeOptions, TemplateInput};
 use tsda_runtime::{BBox, Engine, EngineError, FrameView, ModelSpec, Tracker, probe};
 
 struct Counting;
@@ -108,53 +111,72 @@ fn updates_with_the_shipped_model_allocate_nothing_outside_the_engine() {
     let file = BundleFile::open(tsda_tests::shipped_bundle()).unwrap();
     let bundle = file.bundle().unwrap();
     for choice in EngineChoice::compiled() {
-        let engine = match choice.open(&bundle) {
-            Ok(engine) => Booked(engine),
-            Err(e) if e.is_unasked() => {
-                println!("{choice} skipped: {e}");
-                continue;
-            }
-            Err(e) => panic!("{choice}: {e}"),
-        };
-        // Every found frame is written, so that memory writes are in the count.
-        let mut params = bundle.manifest().tracker;
-        params.not_found = 0.0;
-        params.write_confidence = 0.0;
-        let mut tracker = Tracker::new(engine, params).unwrap();
+        allocates_nothing(&bundle, &choice);
+    }
+}
 
-        let (w, h) = (320, 240);
-        let mut data = vec![0; w * h * 3];
-        probe::recipe_image(5, w, h, &mut data);
-        let view = FrameView::rgb(&data, w, h).unwrap();
-        tracker.init(&view, BBox::new(130.0, 90.0, 48.0, 40.0), None).unwrap();
-        for counter in [&TRACKER, &ENGINE, &ENGINE_BYTES] {
-            counter.set(0);
+#[test]
+fn updates_with_a_network_of_bytes_allocate_nothing() {
+    let file = BundleFile::open(tsda_tests::shipped_bundle()).unwrap();
+    let floats = file.bundle().unwrap();
+    let clips = synthetic::clips();
+    let options = QuantizeOptions { frames: 30, ..QuantizeOptions::default() };
+    let calib = Some(("clips".to_owned(), &clips));
+    let (bytes, _) = quantize_on(&floats, &options, calib, &[], &mut |_| {}).unwrap();
+    let bundle = Bundle::parse(&bytes).unwrap();
+    for threads in [1, 2] {
+        let options = NativeOptions { threads, ..NativeOptions::default() };
+        allocates_nothing(&bundle, &EngineChoice::Native(options));
+    }
+}
+
+fn allocates_nothing(bundle: &Bundle<'_>, choice: &EngineChoice) {
+    let engine = match choice.open(bundle) {
+        Ok(engine) => Booked(engine),
+        Err(e) if e.is_unasked() => {
+            println!("{choice} skipped: {e}");
+            return;
         }
-        let frames = 30;
-        let mut writes = 0;
-        for _ in 0..frames {
-            ACTIVE.set(Counter::Tracker);
-            let track = tracker.update(&view, None);
-            ACTIVE.set(Counter::Off);
-            writes += usize::from(track.unwrap().wrote_memory);
-        }
-        println!(
-            "{choice}: tracker {} allocations in {frames} frames ({writes} memory writes); \
+        Err(e) => panic!("{choice}: {e}"),
+    };
+    // Every found frame is written, so that memory writes are in the count.
+    let mut params = bundle.manifest().tracker;
+    params.not_found = 0.0;
+    params.write_confidence = 0.0;
+    let mut tracker = Tracker::new(engine, params).unwrap();
+
+    let (w, h) = (320, 240);
+    let mut data = vec![0; w * h * 3];
+    probe::recipe_image(5, w, h, &mut data);
+    let view = FrameView::rgb(&data, w, h).unwrap();
+    tracker.init(&view, BBox::new(130.0, 90.0, 48.0, 40.0), None).unwrap();
+    for counter in [&TRACKER, &ENGINE, &ENGINE_BYTES] {
+        counter.set(0);
+    }
+    let frames = 30;
+    let mut writes = 0;
+    for _ in 0..frames {
+        ACTIVE.set(Counter::Tracker);
+        let track = tracker.update(&view, None);
+        ACTIVE.set(Counter::Off);
+        writes += usize::from(track.unwrap().wrote_memory);
+    }
+    println!(
+        "{choice}: tracker {} allocations in {frames} frames ({writes} memory writes); \
              engine {} allocations, {} bytes per frame",
-            TRACKER.get(),
-            ENGINE.get() / frames,
-            ENGINE_BYTES.get() / frames,
-        );
-        assert_eq!(TRACKER.get(), 0, "{choice}: the tracker allocated in its per-frame path");
-        assert!(writes > 0, "{choice}: no memory write was counted");
-        // Bound once: what is left are the lists of outputs that the `ort` crate makes for each of
-        // the three graph calls. Anything more would be a new binding or a copy.
-        match choice {
-            EngineChoice::Native(_) => assert_eq!(ENGINE.get(), 0, "{choice}"),
-            EngineChoice::Ort(_) => {
-                assert!(ENGINE.get() <= 8 * frames && ENGINE_BYTES.get() <= 2048 * frames);
-            }
-            _ => assert!(ENGINE.get() > 0, "the counter sees nothing: tract allocates"),
+        TRACKER.get(),
+        ENGINE.get() / frames,
+        ENGINE_BYTES.get() / frames,
+    );
+    assert_eq!(TRACKER.get(), 0, "{choice}: the tracker allocated in its per-frame path");
+    assert!(writes > 0, "{choice}: no memory write was counted");
+    // Bound once: what is left are the lists of outputs that the `ort` crate makes for each of
+    // the three graph calls. Anything more would be a new binding or a copy.
+    match choice {
+        EngineChoice::Native(_) => assert_eq!(ENGINE.get(), 0, "{choice}"),
+        EngineChoice::Ort(_) => {
+            assert!(ENGINE.get() <= 8 * frames && ENGINE_BYTES.get() <= 2048 * frames);
         }
+        _ => assert!(ENGINE.get() > 0, "the counter sees nothing: tract allocates"),
     }
 }

@@ -55,6 +55,7 @@ fn burn_and_the_engines_drive_the_tracker_alike() {
         licence: "none",
         card: "",
         sections: Default::default(),
+        precision: None,
     };
     let bytes =
         bundle::encode(&manifest, &network::files(&network::graphs(&net).unwrap())).unwrap();

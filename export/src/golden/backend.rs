@@ -390,6 +390,7 @@ fn on_engine<E: Engine + 'static>(
         licence: "none",
         card: "",
         sections: Default::default(),
+        precision: None,
     };
     let graphs = network::graphs(&net)?;
     let engine = {

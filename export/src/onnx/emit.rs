@@ -41,19 +41,32 @@ impl WeightStore {
         self.bytes
     }
 
-    /// Offset and length of `values`, which are added unless equal ones are there.
-    fn place(&mut self, values: &[f32]) -> (usize, usize) {
-        let raw: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+    /// Where a tensor's bytes are, as its `external_data`; they are added unless equal ones are there.
+    pub fn add(&mut self, raw: &[u8]) -> Vec<StringStringEntryProto> {
+        let (offset, length) = self.place(raw);
+        let entry = |key: &str, value: String| StringStringEntryProto {
+            key: Some(key.into()),
+            value: Some(value),
+        };
+        vec![
+            entry("location", self.location.clone()),
+            entry("offset", offset.to_string()),
+            entry("length", length.to_string()),
+        ]
+    }
+
+    /// Offset and length of bytes, which are added unless equal ones are there.
+    fn place(&mut self, raw: &[u8]) -> (usize, usize) {
         let mut hasher = DefaultHasher::new();
         raw.hash(&mut hasher);
         let places = self.places.entry(hasher.finish()).or_default();
-        let held = places.iter().find(|(at, len)| self.bytes[*at..*at + *len] == raw);
+        let held = places.iter().find(|(at, len)| self.bytes[*at..*at + *len] == *raw);
         if let Some(place) = held {
             return *place;
         }
         let start = self.bytes.len().next_multiple_of(Self::ALIGN);
         self.bytes.resize(start, 0);
-        self.bytes.extend_from_slice(&raw);
+        self.bytes.extend_from_slice(raw);
         places.push((start, raw.len()));
         (start, raw.len())
     }
@@ -117,16 +130,8 @@ fn tensor(graph: &Graph, id: ValueId, storage: &mut Storage<'_>) -> TensorProto 
     };
     let raw = match (&value.constant, storage) {
         (Some(Data::F32(v)), Storage::External(store)) if v.len() * 4 >= SMALLEST_EXTERNAL => {
-            let (offset, length) = store.place(v);
-            let entry = |key: &str, value: String| StringStringEntryProto {
-                key: Some(key.into()),
-                value: Some(value),
-            };
-            proto.external_data = vec![
-                entry("location", store.location.clone()),
-                entry("offset", offset.to_string()),
-                entry("length", length.to_string()),
-            ];
+            let raw: Vec<u8> = v.iter().flat_map(|v| v.to_le_bytes()).collect();
+            proto.external_data = store.add(&raw);
             proto.data_location = Some(DATA_LOCATION_EXTERNAL);
             return proto;
         }

@@ -6,7 +6,7 @@ use crate::model;
 use std::fmt::Write as _;
 use std::path::Path;
 use std::time::Instant;
-use tsda_runtime::bundle::{Bundle, SectionKind};
+use tsda_runtime::bundle::{Bundle, Precision, SectionKind};
 use tsda_runtime::engine::AnyEngine;
 use tsda_runtime::probe::{StageTime, stage_times};
 
@@ -94,9 +94,12 @@ fn describe(path: &str, bundle: &Bundle<'_>) -> String {
         row(
             "weights",
             format!(
-                "{} bytes, {} numbers of 32 bits (norms folded in)",
+                "{} bytes, {} (norms folded in)",
                 grouped(weights.len() as u64),
-                grouped(weights.len() as u64 / 4)
+                match &m.precision {
+                    None => format!("{} numbers of 32 bits", grouped(weights.len() as u64 / 4)),
+                    Some(p) => p.numbers.to_string(),
+                }
             ),
         );
     }
@@ -123,6 +126,9 @@ fn describe(path: &str, bundle: &Bundle<'_>) -> String {
     row("steps, seed", format!("{}, {}", m.provenance.steps, m.provenance.seed));
     row("weights crc", format!("{:08x}", m.provenance.weights_crc));
     row("licence", m.licence.to_owned());
+    if let Some(p) = &m.precision {
+        text.push_str(&narrow(p));
+    }
     text.push_str("\nsections\n");
     for s in &m.sections {
         let _ = writeln!(
@@ -144,6 +150,24 @@ fn describe(path: &str, bundle: &Bundle<'_>) -> String {
         if !body.trim().is_empty() {
             let _ = writeln!(text, "\n{title}\n{}", body.trim_end());
         }
+    }
+    text
+}
+
+/// What is narrower than 32 bits, and what that costs.
+fn narrow(p: &Precision<'_>) -> String {
+    let mut text = format!("\nprecision\n  {}\n", p.numbers);
+    if p.numbers.has_bytes() {
+        let _ = writeln!(
+            text,
+            "  {} products in bytes, {} in floats; ranges from {} frames of {}",
+            p.layers, p.kept, p.frames, p.data
+        );
+    }
+    let _ = writeln!(text, "  made of a network of floats, weights crc {:08x}", p.from_crc);
+    for l in &p.losses {
+        let (name, change) = (l.name, l.after - l.before);
+        let _ = writeln!(text, "  {name:<40} {:.4} was {:.4} ({change:+.4})", l.after, l.before);
     }
     text
 }

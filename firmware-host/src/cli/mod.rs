@@ -193,9 +193,9 @@ pub struct VerifyArgs {
     /// Bundle; without it, the embedded one
     #[arg(value_name = "FILE.tsda")]
     pub bundle: Option<PathBuf>,
-    /// Largest absolute difference allowed
-    #[arg(long, default_value_t = 1e-4)]
-    pub tolerance: f32,
+    /// Largest absolute difference allowed [default: 1e-4, for bundles of 8 bits 5e-2]
+    #[arg(long)]
+    pub tolerance: Option<f32>,
     /// Only this engine (docs/engines.md) [default: every one of this build that is on the machine]
     #[arg(long, value_name = "ENGINE")]
     pub engine: Option<EngineChoice>,

@@ -9,9 +9,9 @@ use tsda_runtime::engine::{AnyEngine, EngineChoice};
 use tsda_runtime::probe::{self, Probe};
 
 pub(super) fn run(args: &VerifyArgs) -> Result<u8, HostError> {
-    if !(args.tolerance.is_finite() && args.tolerance >= 0.0) {
+    if let Some(bad) = args.tolerance.filter(|t| !(t.is_finite() && *t >= 0.0)) {
         return Err(HostError::Argument {
-            what: format!("--tolerance {}", args.tolerance),
+            what: format!("--tolerance {bad}"),
             reason: "a number of at least 0 was expected".into(),
         });
     }
@@ -23,11 +23,8 @@ pub(super) fn run(args: &VerifyArgs) -> Result<u8, HostError> {
     let probe = Probe::parse(section, &bundle.manifest().spec)
         .map_err(|e| HostError::Probe { bundle: file.path().to_path_buf(), source: e.into() })?;
 
-    println!(
-        "{}: maximum absolute differences, tolerance {:.0e}",
-        file.path().display(),
-        args.tolerance
-    );
+    let tolerance = args.tolerance.unwrap_or(bundle.manifest().probe_tolerance());
+    println!("{}: maximum absolute differences, tolerance {tolerance:.0e}", file.path().display());
     println!("{:<8} {:>9} {:>12} {:>12} {:>9}", "engine", "templates", "score map", "ltrb map", "");
     let choices = args.engine.clone().map_or_else(EngineChoice::compiled, |choice| vec![choice]);
     let (mut good, mut failed, mut checked) = (true, None, Vec::new());
@@ -36,7 +33,7 @@ pub(super) fn run(args: &VerifyArgs) -> Result<u8, HostError> {
     for choice in &choices {
         let name = choice.to_string();
         let outcome = model::engine(&file, &bundle, choice).and_then(|mut engine| {
-            good &= check(&file, &mut engine, &probe, args.tolerance)?;
+            good &= check(&file, &mut engine, &probe, tolerance)?;
             times += &stage_table(file.path(), &mut engine, &format!("{name:<8} "))?;
             Ok(())
         });

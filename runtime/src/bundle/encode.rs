@@ -1,7 +1,8 @@
 //! Putting a bundle together.
 
 use super::{
-    Bundle, BundleError, HEADER_LEN, Manifest, Section, SectionKind, align_up, crc32, header,
+    Bundle, BundleError, HEADER_LEN, Manifest, PLAIN_VERSION, Section, SectionKind, VERSION,
+    align_up, crc32, header_of,
 };
 use std::string::{String, ToString};
 use std::vec::Vec;
@@ -35,15 +36,19 @@ pub fn encode(
     let mut room = 0;
     let encoded = loop {
         place(&mut manifest, sections, room)?;
-        let encoded =
-            postcard::to_stdvec(&manifest).map_err(|e| EncodeError::Manifest(e.to_string()))?;
+        let failed = |e: postcard::Error| EncodeError::Manifest(e.to_string());
+        let mut encoded = postcard::to_stdvec(&manifest).map_err(failed)?;
+        if let Some(precision) = &manifest.precision {
+            encoded.extend(postcard::to_stdvec(precision).map_err(failed)?);
+        }
         if encoded.len() <= room {
             break encoded;
         }
         room = encoded.len();
     };
-    let head =
-        header(&encoded).ok_or_else(|| EncodeError::Manifest("it is longer than 4 GiB".into()))?;
+    let version = if manifest.precision.is_some() { VERSION } else { PLAIN_VERSION };
+    let head = header_of(version, &encoded)
+        .ok_or_else(|| EncodeError::Manifest("it is longer than 4 GiB".into()))?;
     let mut bytes = head.to_vec();
     bytes.extend_from_slice(&encoded);
     for (entry, (_, body)) in manifest.sections.iter().zip(sections) {

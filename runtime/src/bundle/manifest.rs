@@ -27,6 +27,84 @@ pub struct Manifest<'a> {
     pub card: &'a str,
     /// Where everything else is in the file.
     pub sections: heapless::Vec<Section, 16>,
+    /// Which numbers the weights are stored in and what that costs, when it is not 32-bit floats
+    /// throughout. Stands behind the rest of the manifest, in files of format version 2.
+    #[serde(skip)]
+    pub precision: Option<Precision<'a>>,
+}
+
+/// Narrow numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub enum Numbers {
+    /// Weights and activations of products in 8 bits, everything else in 32-bit floats.
+    Int8,
+    /// Weights stored as 16-bit floats, computed with as 32-bit ones.
+    Half,
+    /// Both: what is not in 8 bits is stored in 16.
+    Int8Half,
+}
+
+impl Numbers {
+    /// Whether products are computed in bytes.
+    pub const fn has_bytes(self) -> bool {
+        matches!(self, Self::Int8 | Self::Int8Half)
+    }
+}
+
+impl core::fmt::Display for Numbers {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(match self {
+            Self::Int8 => "int8",
+            Self::Half => "f16 weights",
+            Self::Int8Half => "int8, f16 weights elsewhere",
+        })
+    }
+}
+
+/// How a network of 32-bit floats was made narrower.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Precision<'a> {
+    /// Which numbers.
+    pub numbers: Numbers,
+    /// Products in bytes, over all graphs.
+    pub layers: u32,
+    /// Products with constant weights that stay in floats, over all graphs.
+    pub kept: u32,
+    /// What the ranges of activations were measured on; empty when there are none.
+    pub data: &'a str,
+    /// Frames of it.
+    pub frames: u32,
+    /// CRC-32 of the weights section before.
+    pub from_crc: u32,
+    /// Figures before and after.
+    #[serde(borrow)]
+    pub losses: heapless::Vec<Loss<'a>, 24>,
+}
+
+/// One figure of the tracker before and after.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Loss<'a> {
+    /// What was measured, on what.
+    pub name: &'a str,
+    /// With 32-bit floats.
+    pub before: f32,
+    /// With the narrower numbers.
+    pub after: f32,
+}
+
+impl Manifest<'_> {
+    /// How far an engine may be off the stored reference outputs: rounding to bytes turns the last
+    /// bit of a sum into a step now and then.
+    pub fn probe_tolerance(&self) -> f32 {
+        match &self.precision {
+            Some(p) if p.numbers.has_bytes() => Self::BYTE_TOLERANCE,
+            _ => 1e-4,
+        }
+    }
+
+    /// See [`Self::probe_tolerance`].
+    pub const BYTE_TOLERANCE: f32 = 5e-2;
 }
 
 /// Sensors seen in training.

@@ -6,7 +6,7 @@
 //! 12  u32 LE    length of the manifest in bytes
 //! 16  u32 LE    CRC-32 of the manifest
 //! 20  u32 LE    CRC-32 of bytes 0..20
-//! 24  manifest  postcard, see [`Manifest`]
+//! 24  manifest  postcard, see [`Manifest`]; in version 2 with a [`Precision`] behind it
 //! ..  sections  each at a multiple of 64 bytes from the start of the file, zero-padded between;
 //!               offset, length and CRC-32 stand in the manifest
 //! ```
@@ -28,7 +28,8 @@ pub use encode::{EncodeError, encode};
 #[cfg(feature = "std")]
 pub use file::{BundleFile, BundleFileError};
 pub use manifest::{
-    Figure, Manifest, Provenance, ScoreCalibration, Section, SectionKind, TrainedOn,
+    Figure, Loss, Manifest, Numbers, Precision, Provenance, ScoreCalibration, Section, SectionKind,
+    TrainedOn,
 };
 
 use crate::spec::SpecError;
@@ -36,8 +37,11 @@ use crate::spec::SpecError;
 /// First eight bytes of every bundle. Line-ending and end-of-file bytes in it catch text-mode
 /// transfers.
 pub const MAGIC: [u8; 8] = *b"TSDA\r\n\x1a\n";
-/// Format version written by this crate, and the newest it reads.
-pub const VERSION: u32 = 1;
+/// The newest format version this crate reads. Bundles without a [`Precision`] are written as
+/// version 1, which older programs read too.
+pub const VERSION: u32 = 2;
+/// The version of bundles without a [`Precision`].
+pub const PLAIN_VERSION: u32 = 1;
 /// Bytes before the manifest.
 pub const HEADER_LEN: usize = 24;
 /// Sections start at multiples of this.
@@ -55,12 +59,17 @@ pub fn crc32(bytes: &[u8]) -> u32 {
     crc32fast::hash(bytes)
 }
 
-/// The first [`HEADER_LEN`] bytes of a bundle whose encoded manifest is `manifest`. `None` when the
-/// manifest is longer than 4 GiB.
+/// The first [`HEADER_LEN`] bytes of a bundle of version [`PLAIN_VERSION`] whose encoded manifest is
+/// `manifest`. `None` when the manifest is longer than 4 GiB.
 pub fn header(manifest: &[u8]) -> Option<[u8; HEADER_LEN]> {
+    header_of(PLAIN_VERSION, manifest)
+}
+
+/// As [`header`], for a format version.
+pub fn header_of(version: u32, manifest: &[u8]) -> Option<[u8; HEADER_LEN]> {
     let mut out = [0; HEADER_LEN];
     out[..8].copy_from_slice(&MAGIC);
-    out[8..12].copy_from_slice(&VERSION.to_le_bytes());
+    out[8..12].copy_from_slice(&version.to_le_bytes());
     out[12..16].copy_from_slice(&u32::try_from(manifest.len()).ok()?.to_le_bytes());
     out[16..20].copy_from_slice(&crc32(manifest).to_le_bytes());
     let crc = crc32(&out[..20]);
@@ -214,8 +223,13 @@ impl<'a> Bundle<'a> {
         if crc32(raw) != word(16) {
             return Err(BundleError::Checksum { part: Part::Manifest });
         }
-        let (manifest, unread): (Manifest<'a>, _) =
+        let (mut manifest, mut unread): (Manifest<'a>, _) =
             postcard::take_from_bytes(raw).map_err(BundleError::Decode)?;
+        if version > PLAIN_VERSION {
+            let (precision, rest) =
+                postcard::take_from_bytes(unread).map_err(BundleError::Decode)?;
+            (manifest.precision, unread) = (Some(precision), rest);
+        }
         if !unread.is_empty() {
             return Err(BundleError::Decode(postcard::Error::SerdeDeCustom));
         }

@@ -14,6 +14,7 @@ fn manifest<'a>() -> Manifest<'a> {
         licence: "MIT",
         card: "# card",
         sections: heapless::Vec::new(),
+        precision: None,
     }
 }
 
@@ -217,4 +218,40 @@ fn another_calibration_leaves_every_section_as_it_was() {
     let manifest = Manifest { calibration: upside_down, ..bundle.manifest().clone() };
     let error = encode(&manifest, &sections).unwrap_err().to_string();
     assert!(error.contains("calibration.slope"), "{error}");
+}
+
+fn precision<'a>() -> Precision<'a> {
+    Precision {
+        numbers: Numbers::Int8,
+        layers: 40,
+        kept: 3,
+        data: "pairs, train",
+        frames: 100,
+        from_crc: 7,
+        losses: heapless::Vec::from_slice(&[Loss { name: "SR0.5", before: 0.6, after: 0.59 }])
+            .unwrap(),
+    }
+}
+
+#[test]
+fn a_precision_stands_behind_the_manifest() {
+    let narrow = Manifest { precision: Some(precision()), ..manifest() };
+    let bytes = encode(&narrow, &SECTIONS).unwrap();
+    assert_eq!(bytes[8], 2, "older programs must not take it for a network of floats");
+    let bundle = Bundle::parse(&bytes).unwrap();
+    assert_eq!(bundle.manifest().precision, Some(precision()));
+    assert_eq!(bundle.section(SectionKind::Weights), Some(&[9; 200][..]));
+    assert!(bundle.manifest().probe_tolerance() > manifest().probe_tolerance());
+    // Every cut and every changed byte of header and manifest is noticed.
+    let end = bundle.manifest().sections[0].offset as usize;
+    for at in 0..end {
+        let mut other = bytes.clone();
+        other[at] ^= 1;
+        assert!(Bundle::parse(&other).is_err(), "byte {at}");
+        assert!(Bundle::parse(&bytes[..at]).is_err(), "cut at {at}");
+    }
+    // Bundles without one stay what older programs read.
+    let plain = encode(&manifest(), &SECTIONS).unwrap();
+    assert_eq!(plain[8], 1);
+    assert_eq!(Bundle::parse(&plain).unwrap().manifest().precision, None);
 }

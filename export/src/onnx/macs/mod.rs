@@ -12,7 +12,8 @@ mod tests;
 pub use shapes::ShapeError;
 
 use super::graph::{Graph, Node};
-use super::proto::{ModelProto, NodeProto};
+use super::proto::{GraphProto, ModelProto, NodeProto};
+use std::collections::HashMap;
 
 /// What one operation costs.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -59,6 +60,15 @@ pub fn count_model(model: &ModelProto) -> Result<Vec<NodeMacs>, ShapeError> {
         }
     }
     Ok(counted)
+}
+
+/// Shapes of all tensors of a model file, by name.
+///
+/// # Errors
+/// As [`count_model`].
+pub fn shapes(graph: &GraphProto) -> Result<HashMap<String, Vec<usize>>, ShapeError> {
+    let known = shapes::infer(graph)?;
+    Ok(known.into_iter().map(|(name, shape)| (name.to_owned(), shape.dims)).collect())
 }
 
 fn transposed(node: &NodeProto) -> bool {

@@ -119,12 +119,11 @@ impl Rule<'_> {
     fn output(&self) -> Option<Vec<usize>> {
         let x = self.dims(0)?;
         match self.node.op_type.as_deref()? {
-            "Identity" | "Cast" | "Relu" | "LeakyRelu" | "PRelu" | "Sigmoid" | "HardSigmoid"
-            | "Clip" | "Exp" | "Log" | "Sqrt" | "Reciprocal" | "Abs" | "Neg" | "Sign" | "Floor"
-            | "Ceil" | "Round" | "Erf" | "Sin" | "Cos" | "Tan" | "Tanh" | "Atan" | "Softmax"
-            | "LogSoftmax" | "Softplus" | "Not" | "BatchNormalization" | "LayerNormalization" => {
-                Some(x.to_vec())
-            }
+            "Identity" | "Cast" | "QuantizeLinear" | "DequantizeLinear" | "Relu" | "LeakyRelu"
+            | "PRelu" | "Sigmoid" | "HardSigmoid" | "Clip" | "Exp" | "Log" | "Sqrt"
+            | "Reciprocal" | "Abs" | "Neg" | "Sign" | "Floor" | "Ceil" | "Round" | "Erf"
+            | "Sin" | "Cos" | "Tan" | "Tanh" | "Atan" | "Softmax" | "LogSoftmax" | "Softplus"
+            | "Not" | "BatchNormalization" | "LayerNormalization" => Some(x.to_vec()),
             "Add" | "Sub" | "Mul" | "Div" | "Pow" | "Max" | "Min" | "And" | "Or" | "Xor"
             | "Equal" | "Greater" | "GreaterOrEqual" | "Less" | "LessOrEqual" | "Where" => {
                 let shapes = self.inputs.iter().map(|s| s.map(|s| &s.dims[..]));

@@ -23,13 +23,23 @@ impl GraphSession {
     /// # Errors
     /// When the file is damaged or has a node that is not supported.
     pub fn new(onnx: &[u8]) -> Result<Self, EngineError> {
+        Self::with_weights(onnx, &[], Isa::best())
+    }
+
+    /// Compiles an ONNX file whose large constants are in `weights`, as those of bundles are, for
+    /// one thread and an instruction set.
+    ///
+    /// # Errors
+    /// As [`Self::new`]; also when the processor lacks the instruction set.
+    pub fn with_weights(onnx: &[u8], weights: &[u8], isa: Isa) -> Result<Self, EngineError> {
         let failed = |e: &dyn core::fmt::Display| error(Stage::Load, format_args!("{e}"));
-        let mut graph = graph::read(onnx, &[]).map_err(|e| failed(&e))?;
+        let mut graph = graph::read(onnx, weights).map_err(|e| failed(&e))?;
         graph::fuse(&mut graph);
-        let Some(kernels) = Isa::best().kernels() else {
-            return Err(failed(&"this processor has no kernels"));
+        let Some(kernels) = isa.kernels() else {
+            return Err(failed(&format_args!("this processor has no {}", isa.name())));
         };
-        let mut planner = Planner::new(kernels, 1, onnx.len() / 4, None);
+        let size = (onnx.len() + weights.len()) / 4;
+        let mut planner = Planner::new(kernels, 1, size, None);
         let mut place = |ids: &[usize]| -> Vec<(String, Range<usize>, View)> {
             ids.iter()
                 .map(|&id| {

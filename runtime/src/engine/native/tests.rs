@@ -1,5 +1,7 @@
 //! Small graphs written by hand: what is computed, and what is refused.
 
+mod bytes;
+
 use super::*;
 use crate::bundle::{
     HEADER_LEN, Manifest, Provenance, Section, SectionKind as Kind, TrainedOn, WEIGHTS_FILE,
@@ -192,6 +194,7 @@ fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
         licence: "MIT",
         card: "",
         sections: Default::default(),
+        precision: None,
     };
     let mut at = 4096;
     for (kind, bytes) in parts {

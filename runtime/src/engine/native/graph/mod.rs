@@ -40,6 +40,24 @@ pub enum Data<'a> {
     Bytes(&'a [u8]),
     /// Floats made while reading.
     Floats(Vec<f32>),
+    /// Little-endian 16-bit floats in the bundle.
+    Halves(&'a [u8]),
+    /// Bytes in the bundle: weights before they are scaled, zero points. Known to the reader only.
+    Bytes8 {
+        /// The numbers.
+        bytes: &'a [u8],
+        /// Whether they go from -128 to 127.
+        signed: bool,
+    },
+    /// Signed bytes in the bundle that stand for `byte * scale`.
+    Scaled {
+        /// The numbers.
+        bytes: &'a [u8],
+        /// One for all, or one per channel.
+        scale: Vec<f32>,
+        /// Elements from a channel to the next.
+        inner: usize,
+    },
     /// Shapes, axes, indices: known to the reader only.
     Ints(Vec<i64>),
 }
@@ -50,8 +68,31 @@ impl Data<'_> {
         match self {
             Self::Bytes(bytes) => proto::floats(bytes).collect(),
             Self::Floats(values) => values.clone(),
-            Self::Ints(_) => Vec::new(),
+            Self::Halves(bytes) => {
+                let halves = bytes.as_chunks::<2>().0.iter();
+                halves.map(|b| half(u16::from_le_bytes(*b))).collect()
+            }
+            Self::Scaled { bytes, scale, inner } => {
+                let numbers = bytes.iter().enumerate();
+                let scaled = |(i, b): (usize, &u8)| {
+                    f32::from(b.cast_signed()) * scale[i / inner % scale.len()]
+                };
+                numbers.map(scaled).collect()
+            }
+            Self::Bytes8 { .. } | Self::Ints(_) => Vec::new(),
         }
+    }
+}
+
+/// A 16-bit float.
+fn half(bits: u16) -> f32 {
+    let sign = u32::from(bits & 0x8000) << 16;
+    let (exponent, fraction) = (u32::from(bits >> 10 & 0x1f), u32::from(bits & 0x3ff));
+    match exponent {
+        // Below the smallest normal number steps are of 2^-24.
+        0 => f32::from_bits((fraction as f32 * 2f32.powi(-24)).to_bits() | sign),
+        31 => f32::from_bits(sign | 0x7f80_0000 | fraction << 13),
+        _ => f32::from_bits(sign | (exponent + 112) << 23 | fraction << 13),
     }
 }
 
@@ -95,6 +136,13 @@ pub enum Unary {
     Sin,
     /// Cosine.
     Cos,
+    /// To the nearest number that a byte stands for: `(byte - zero) * scale`.
+    Round {
+        /// Step.
+        scale: f32,
+        /// The byte for 0.
+        zero: u8,
+    },
 }
 
 /// A function of two numbers.

@@ -1,5 +1,6 @@
 //! ONNX nodes to [`Op`]s: settings read, shapes computed, everything unknown refused.
 
+mod bytes;
 mod moves;
 
 use super::{
@@ -17,7 +18,10 @@ const MAX_ELEMENTS: usize = 1 << 26;
 pub const MAX_RANK: usize = 6;
 
 const F32: i64 = 1;
+const U8: i64 = 2;
+const I8: i64 = 3;
 const I64: i64 = 7;
+const F16: i64 = 10;
 
 type Result<T> = core::result::Result<T, GraphError>;
 /// Result of reading one node; the reason only, the caller knows the node.
@@ -28,7 +32,8 @@ pub fn read<'a>(bytes: &'a [u8], weights: &'a [u8]) -> Result<Graph<'a>> {
     let Some(file) = proto::read(bytes)? else {
         return Err(GraphError::Graph("the file holds no graph".into()));
     };
-    let mut reader = Reader { graph: Graph::default(), names: HashMap::new() };
+    let mut reader =
+        Reader { graph: Graph::default(), names: HashMap::new(), bytes: HashMap::new() };
     for tensor in &file.initializers {
         let value = constant(tensor, weights)
             .map_err(|reason| GraphError::Graph(format!("tensor `{}`: {reason}", tensor.name)))?;
@@ -108,7 +113,14 @@ fn constant<'a>(tensor: &proto::Tensor<'a>, weights: &'a [u8]) -> Step<Value<'a>
             (Data::Ints(ints), raw.len() as f64 / 8.0)
         }
         (I64, None) => (Data::Ints(tensor.ints.clone()), tensor.ints.len() as f64),
-        (other, _) => return Err(format!("element type {other}; f32 and i64 are supported")),
+        (F16, Some(raw)) => (Data::Halves(raw), raw.len() as f64 / 2.0),
+        (kind @ (U8 | I8), Some(bytes)) => {
+            (Data::Bytes8 { bytes, signed: kind == I8 }, bytes.len() as f64)
+        }
+        (U8 | I8 | F16, None) => return Err("its elements must be raw data".into()),
+        (other, _) => {
+            return Err(format!("element type {other}; f32, f16, i8, u8 and i64 are supported"));
+        }
     };
     if found != elements as f64 {
         return Err(format!("{found} elements are stored for its shape {shape:?}"));
@@ -147,6 +159,8 @@ fn external<'a>(tensor: &proto::Tensor<'a>, weights: &'a [u8]) -> Step<&'a [u8]>
 struct Reader<'a> {
     graph: Graph<'a>,
     names: HashMap<String, ValueId>,
+    /// Results that are bytes in the file; only `DequantizeLinear` may use them.
+    bytes: HashMap<String, bytes::Rounding>,
 }
 
 /// The settings and operands of one node.
@@ -289,7 +303,7 @@ impl<'a> Reader<'a> {
             return Err(format!("`{output}` is defined twice"));
         }
         for &id in &inputs {
-            if matches!(self.graph.values[id].data, Some(Data::Ints(_))) {
+            if matches!(self.graph.values[id].data, Some(Data::Ints(_) | Data::Bytes8 { .. })) {
                 let name = &self.graph.values[id].name;
                 return Err(format!("`{name}` holds integers, floats are needed"));
             }
@@ -321,6 +335,9 @@ impl<'a> Reader<'a> {
     fn node(&mut self, node: &proto::Node<'a>) -> Step<()> {
         let mut inputs = Vec::with_capacity(node.inputs.len());
         for &name in &node.inputs {
+            if self.bytes.contains_key(name) && node.op != "DequantizeLinear" {
+                return Err(format!("`{name}` holds bytes; only DequantizeLinear can use them"));
+            }
             inputs.push(match (name, self.names.get(name)) {
                 ("", _) => None,
                 (_, Some(&id)) => Some(id),
@@ -352,6 +369,9 @@ impl<'a> Reader<'a> {
             "Tanh" => self.unary(&call, Unary::Tanh),
             "Sin" => self.unary(&call, Unary::Sin),
             "Cos" => self.unary(&call, Unary::Cos),
+            "QuantizeLinear" => self.quantise(&call),
+            "DequantizeLinear" => self.dequantise(&call),
+            "Cast" => self.cast(&call),
             "Identity" | "Dropout" => self.reshape_to(&call, self.shape(call.input(0)?)),
             "Add" => self.binary(&call, Binary::Add),
             "Sub" => self.binary(&call, Binary::Sub),

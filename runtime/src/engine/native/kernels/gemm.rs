@@ -2,12 +2,15 @@
 //! pixels or tokens wherever they lie; weights are packed into panels, in the order they are read.
 
 use super::simd::Simd;
-use super::table::{Kernels, MAX_ROWS};
+use super::table::{Kernels, MAX_ROWS, MAX_VECTORS};
 use super::{Halo, Mem, Part, Pitch, Place};
 
 /// Panels of packed weights smaller than this stay in the second-level cache, so tiles of rows can
 /// be the outer loop.
 const RESIDENT: usize = 96 * 1024;
+
+/// Computes one tile.
+pub type TileFn = unsafe fn(&Tile);
 
 /// `out = clamp(in * weights + bias + residual)`.
 #[derive(Clone, Debug)]
@@ -40,6 +43,10 @@ pub struct Gemm {
     pub halo: Option<Halo>,
     /// Rows whose inputs fit into the second-level cache together with a panel.
     pub block: usize,
+    /// With it input and weights are 8-bit numbers, four in the place of a float
+    /// ([`super::Eight`]), and these are the factors of the columns, padded like the bias, which
+    /// must be there.
+    pub scales: Option<usize>,
 }
 
 /// How weights are laid out: panels of `width` columns, the last one of as many whole vectors as it
@@ -108,6 +115,8 @@ pub struct Tile {
     pub column: usize,
     /// Columns to store.
     pub columns: usize,
+    /// Factors of the columns; products of 8-bit numbers only.
+    pub scales: *const f32,
     /// Whether `r` is read.
     pub residual: bool,
     /// Factors of the rows, or null.
@@ -128,6 +137,7 @@ impl Tile {
         bias: core::ptr::null(),
         column: 0,
         columns: 0,
+        scales: core::ptr::null(),
         residual: false,
         factors: core::ptr::null(),
         clamp: (f32::NEG_INFINITY, f32::INFINITY),
@@ -269,6 +279,14 @@ unsafe fn ragged<S: Simd, const R: usize, const NV: usize>(
 /// Most floats of a vector of any instruction set.
 const MAX_LANES: usize = 16;
 
+/// Tiles of one type of numbers.
+#[derive(Clone, Copy)]
+struct Tiles<'k> {
+    rows: usize,
+    packing: Packing,
+    of: &'k [[TileFn; MAX_ROWS]; MAX_VECTORS],
+}
+
 /// Rows and panels that one thread computes.
 struct Share {
     tiles: core::ops::Range<usize>,
@@ -286,9 +304,20 @@ impl Gemm {
         self.taps.len() * self.run
     }
 
+    /// How its weights are packed.
+    pub const fn packing(&self, k: &Kernels) -> Packing {
+        if self.scales.is_some() { k.eight.packing } else { k.packing }
+    }
+
+    const fn tiles<'k>(&self, k: &'k Kernels) -> Tiles<'k> {
+        let (rows, of) =
+            if self.scales.is_some() { (k.eight.rows, &k.eight.tiles) } else { (k.rows, &k.tiles) };
+        Tiles { rows, packing: self.packing(k), of }
+    }
+
     /// Splits rows or columns, whichever comes out more evenly; of two even splits the one that
     /// reads less.
-    fn share(&self, k: &Kernels, part: Part) -> Share {
+    fn share(&self, k: Tiles<'_>, part: Part) -> Share {
         let tiles = self.rows().div_ceil(k.rows);
         let panels = self.columns.div_ceil(k.packing.width);
         let busy = |n: usize| n as f32 / (n.div_ceil(part.of) * part.of) as f32;
@@ -312,12 +341,14 @@ impl Gemm {
             if let Some(halo) = self.halo.as_ref().filter(|_| part.id == 0) {
                 halo.clear(mem);
             }
+            let k = self.tiles(k);
             let share = self.share(k, part);
             let mut tile = Tile {
                 taps: self.taps.as_ptr(),
                 tap_count: self.taps.len(),
                 run: self.run,
                 bias: self.bias.map_or(core::ptr::null(), |at| mem.weights.add(at)),
+                scales: self.scales.map_or(core::ptr::null(), |at| mem.weights.add(at)),
                 residual: self.residual.is_some(),
                 clamp: self.clamp,
                 ..Tile::EMPTY
@@ -349,7 +380,7 @@ impl Gemm {
 
     /// Points the tile at rows `i * k.rows ..`; returns how many there are.
     #[inline]
-    unsafe fn point(&self, tile: &mut Tile, k: &Kernels, mem: Mem, i: usize) -> usize {
+    unsafe fn point(&self, tile: &mut Tile, k: Tiles<'_>, mem: Mem, i: usize) -> usize {
         let first = i * k.rows;
         let rows = k.rows.min(self.rows() - first);
         let (mut y, mut x) = (first / self.size[1], first % self.size[1]);
@@ -373,14 +404,14 @@ impl Gemm {
     }
 
     #[inline]
-    unsafe fn panel(&self, tile: &mut Tile, k: &Kernels, mem: Mem, panel: usize, rows: usize) {
+    unsafe fn panel(&self, tile: &mut Tile, k: Tiles<'_>, mem: Mem, panel: usize, rows: usize) {
         tile.column = panel * k.packing.width;
         tile.columns = k.packing.width.min(self.columns - tile.column);
         let vectors = tile.columns.div_ceil(k.packing.lanes);
         // SAFETY: the panel is inside the packed weights, and the tile is as the kernel wants it.
         unsafe {
             tile.b = mem.weights.add(self.weights + tile.column * self.depth());
-            (k.tiles[vectors - 1][rows - 1])(tile);
+            (k.of[vectors - 1][rows - 1])(tile);
         }
     }
 }

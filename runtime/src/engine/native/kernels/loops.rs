@@ -205,6 +205,14 @@ pub unsafe fn map(s: &Map, mem: Mem, part: Part) {
             Unary::Tanh => map_with(s, mem, part, f32::tanh),
             Unary::Sin => map_with(s, mem, part, f32::sin),
             Unary::Cos => map_with(s, mem, part, f32::cos),
+            Unary::Round { scale, zero } => {
+                let (factor, zero) = (1.0 / scale, f32::from(zero));
+                map_with(s, mem, part, |x| {
+                    let byte = (x * factor).round_ties_even() + zero;
+                    let byte = if byte < 0.0 { 0.0 } else { byte };
+                    (if byte > 255.0 { 255.0 } else { byte } - zero) * scale
+                });
+            }
         }
     }
 }

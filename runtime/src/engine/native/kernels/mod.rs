@@ -16,6 +16,7 @@
 
 mod attention;
 mod conv;
+mod eight;
 mod gemm;
 mod loops;
 mod matmul;
@@ -33,6 +34,7 @@ mod x86;
 
 pub use attention::{Attention, PackKv, ThinAttention};
 pub use conv::{Depthwise, Pool};
+pub use eight::{Eight, Quantise};
 pub use gemm::Gemm;
 pub use loops::{Copy, Fold, Map, Nest, Zip};
 pub use matmul::MatMul;
@@ -84,17 +86,26 @@ impl Halo {
     /// # Safety
     /// The border lies inside the arena and nobody else touches it.
     unsafe fn clear(&self, mem: Mem) {
+        // SAFETY: passed on.
+        unsafe { self.fill(mem, 0) }
+    }
+
+    /// Writes this byte everywhere, for maps of bytes.
+    ///
+    /// # Safety
+    /// As for [`Self::clear`].
+    unsafe fn fill(&self, mem: Mem, byte: u8) {
         let (side, above) = (self.width * self.pixel, self.width * self.line);
         let below = (self.size[0] + self.width) * self.line;
         // SAFETY: all within `len` floats from the start, which the program has checked.
         unsafe {
             let start = mem.arena.add(self.start);
-            start.write_bytes(0, above);
-            start.add(below).write_bytes(0, above);
+            start.write_bytes(byte, above);
+            start.add(below).write_bytes(byte, above);
             for line in self.width..self.width + self.size[0] {
                 let left = start.add(line * self.line);
-                left.write_bytes(0, side);
-                left.add(self.line - side).write_bytes(0, side);
+                left.write_bytes(byte, side);
+                left.add(self.line - side).write_bytes(byte, side);
             }
         }
     }

@@ -1,7 +1,11 @@
 //! NEON, which every aarch64 processor has.
 
+mod dot;
+
 use super::simd::Simd;
 use core::arch::aarch64::*;
+
+pub use dot::{DotProd, Wide};
 
 /// Four floats.
 #[derive(Clone, Copy)]

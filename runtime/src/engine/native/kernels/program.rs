@@ -1,9 +1,10 @@
 //! A checked list of steps, and how a team of threads goes through it.
 
 use super::attention::Attention;
+use super::eight::BYTES;
 use super::{
-    Copy, Depthwise, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem, PackKv, Part,
-    Pitch, Place, Pool, Softmax, ThinAttention, Zip,
+    Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem,
+    PackKv, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
 };
 use crate::engine::native::sync::Barrier;
 
@@ -17,6 +18,8 @@ pub enum Step {
     Clear(Halo),
     /// Product with a constant matrix, or convolution.
     Gemm(Gemm),
+    /// Floats to bytes.
+    Quantise(Quantise),
     /// Convolution per channel.
     Depthwise(Depthwise),
     /// Maximum or mean over windows.
@@ -119,8 +122,13 @@ impl Step {
     pub const fn name(&self) -> &'static str {
         match self {
             Self::Clear(_) => "clear",
-            Self::Gemm(s) if s.taps.len() > 1 || s.size[0] > 1 => "convolution",
-            Self::Gemm(_) => "linear",
+            Self::Gemm(s) => match (s.taps.len() > 1 || s.size[0] > 1, s.scales.is_some()) {
+                (true, false) => "convolution",
+                (true, true) => "convolution of bytes",
+                (false, false) => "linear",
+                (false, true) => "linear of bytes",
+            },
+            Self::Quantise(_) => "to bytes",
             Self::Depthwise(_) => "depthwise",
             Self::Pool(_) => "pool",
             Self::Copy(_) => "copy",
@@ -141,7 +149,11 @@ impl Step {
     pub fn cost(&self) -> Cost {
         let operations = match self {
             Self::Clear(s) => s.len() / 4,
-            Self::Gemm(s) => 2 * s.rows() * s.columns * s.depth(),
+            Self::Gemm(s) => {
+                let numbers = if s.scales.is_some() { BYTES } else { 1 };
+                2 * s.rows() * s.columns * s.depth() * numbers
+            }
+            Self::Quantise(s) => 4 * s.size[0] * s.size[1] * s.channels,
             Self::Depthwise(s) => 2 * s.size[0] * s.size[1] * s.channels * s.taps.len(),
             Self::Pool(s) => s.size[0] * s.size[1] * s.channels * s.kernel[0] * s.kernel[1],
             Self::Copy(s) => 2 * s.nest.len(),
@@ -193,6 +205,11 @@ impl Step {
                 if let Some((from, _)) = &mut s.residual {
                     place(from);
                 }
+                at(&mut s.output);
+                border(&mut s.halo);
+            }
+            Self::Quantise(s) => {
+                place(&mut s.input);
                 at(&mut s.output);
                 border(&mut s.halo);
             }
@@ -266,13 +283,22 @@ impl Step {
             Self::Gemm(s) => {
                 let reach = s.taps.iter().copied().max().unwrap_or(0) + s.run;
                 spans.read(s.input, extent(s.size, s.input_pitch, reach));
-                spans.weights(Some(s.weights), k.packing.len(s.depth(), s.columns));
-                spans.weights(s.bias, k.packing.columns(s.columns));
+                let packing = s.packing(k);
+                spans.weights(Some(s.weights), packing.len(s.depth(), s.columns));
+                spans.weights(s.bias, packing.columns(s.columns));
+                spans.weights(s.scales, packing.columns(s.columns));
+                let biased = s.scales.is_none() || s.bias.is_some();
+                spans.demand(biased, "it has bytes but no bias");
                 if let Some((place, pitch)) = s.residual {
                     spans.read(place, extent(s.size, pitch, s.columns));
                 }
                 spans.map(s.output, s.size, s.output_pitch, s.columns, s.halo.as_ref());
                 spans.demand(s.columns > 0, "it has no columns");
+            }
+            Self::Quantise(s) => {
+                spans.read(s.input, extent(s.size, s.input_pitch, s.channels));
+                let run = Eight::floats(s.channels);
+                spans.map(s.output, s.size, s.output_pitch, run, s.halo.as_ref());
             }
             Self::Depthwise(s) => {
                 let reach = s.taps.iter().copied().max().unwrap_or(0) + s.channels;
@@ -386,6 +412,7 @@ impl Step {
                     }
                 }
                 Self::Gemm(s) => s.run(k, mem, part),
+                Self::Quantise(s) => (k.eight.quantise)(s, mem, part),
                 Self::Depthwise(s) => (k.depthwise)(s, mem, part),
                 Self::Pool(s) => (k.pool)(s, mem, part),
                 Self::Copy(s) => s.run(mem, part),

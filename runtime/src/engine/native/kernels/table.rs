@@ -2,7 +2,8 @@
 
 use super::attention::{self, Attention, ThinAttention};
 use super::conv::{self, Depthwise, Pool};
-use super::gemm::{self, Packing, Tile};
+use super::eight::{self, Dot, Eight, Quantise, ScalarDot};
+use super::gemm::{self, Packing, Tile, TileFn};
 use super::loops::{self, Fold, Map, Zip};
 use super::matmul::{self, MatMul};
 use super::norms::{self, LayerNorm, MapNorm, Softmax};
@@ -13,8 +14,6 @@ use super::{Mem, Part};
 pub const MAX_ROWS: usize = 12;
 /// Most vectors of columns of a tile.
 pub const MAX_VECTORS: usize = 2;
-
-type TileFn = unsafe fn(&Tile);
 
 /// Instruction sets that kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,12 +50,20 @@ impl Isa {
             Self::Scalar => Some(&SCALAR),
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") => {
-                Some(&AVX2)
+                let vnni = is_x86_feature_detected!("avxvnni");
+                Some(if vnni { &AVX2_VNNI } else { &AVX2 })
             }
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512 if is_x86_feature_detected!("avx512f") => Some(&AVX512),
+            Self::Avx512 if is_x86_feature_detected!("avx512f") => {
+                let vnni = is_x86_feature_detected!("avx512vnni");
+                // Without it products of bytes are those of AVX2, which every such processor has.
+                Some(if vnni { &AVX512_VNNI } else { &AVX512 })
+            }
             #[cfg(target_arch = "aarch64")]
-            Self::Neon => Some(&NEON),
+            Self::Neon => {
+                let dot = std::arch::is_aarch64_feature_detected!("dotprod");
+                Some(if dot { &NEON_DOT } else { &NEON })
+            }
             _ => None,
         }
     }
@@ -81,6 +88,8 @@ pub struct Kernels {
     /// Layout of packed matrices.
     pub packing: Packing,
     pub(super) tiles: [[TileFn; MAX_ROWS]; MAX_VECTORS],
+    /// Products of 8-bit numbers.
+    pub eight: Eight,
     pub(super) depthwise: unsafe fn(&Depthwise, Mem, Part),
     pub(super) pool: unsafe fn(&Pool, Mem, Part),
     pub(super) layer_norm: unsafe fn(&LayerNorm, Mem, Part),
@@ -103,9 +112,10 @@ impl Kernels {
     }
 }
 
-/// Makes the table of an instruction set. `$rows` is the height of its tile.
+/// Makes the table of an instruction set. `$rows` is the height of its tile, `$eight` what it does
+/// with bytes where the processor has nothing better.
 macro_rules! table {
-    ($table:ident, $module:ident, $set:ty, $rows:tt, $feature:tt) => {
+    ($table:ident, $module:ident, $set:ty, $rows:tt, $feature:tt, $eight:ident) => {
         mod $module {
             use super::*;
             #[allow(unused_imports)]
@@ -131,13 +141,14 @@ macro_rules! table {
                 table!(@rows $rows, NV)
             }
 
-            pub static TABLE: Kernels = Kernels {
+            pub const TABLE: Kernels = Kernels {
                 rows: $rows,
                 packing: Packing {
                     width: MAX_VECTORS * <$set as Simd>::LANES,
                     lanes: <$set as Simd>::LANES,
                 },
                 tiles: [tiles::<1>(), tiles::<2>()],
+                eight: $eight,
                 depthwise,
                 pool,
                 layer_norm,
@@ -151,7 +162,7 @@ macro_rules! table {
                 weigh,
             };
         }
-        use $module::TABLE as $table;
+        static $table: Kernels = $module::TABLE;
     };
     (@each $set:ty, $feature:tt,
         tile<R, NV>($t:ident: &Tile) => $tile:expr;
@@ -173,6 +184,35 @@ macro_rules! table {
             // SAFETY: the caller promises a checked step, the attribute the instruction set.
             unsafe { $body }
         }
+    };
+    // The functions for bytes, in a module of their own.
+    (@eight $eight:ident, $module:ident, $dot:ty, $rows:tt, $feature:tt) => {
+        mod $module {
+            use super::*;
+            #[allow(unused_imports)]
+            use super::super::*;
+
+            table!(@one $feature tile[R, NV](t: &Tile) => eight::tile::<$dot, R, NV>(t));
+            table!(@one $feature quantise[](s: &Quantise, m: Mem, p: Part)
+                => eight::quantise::<$dot>(s, m, p));
+
+            const fn tiles<const NV: usize>() -> [TileFn; MAX_ROWS] {
+                table!(@rows $rows, NV)
+            }
+
+            pub const EIGHT: Eight = Eight {
+                rows: $rows,
+                packing: Packing {
+                    width: MAX_VECTORS * <<$dot as Dot>::F as Simd>::LANES,
+                    lanes: <<$dot as Dot>::F as Simd>::LANES,
+                },
+                layout: <$dot as Dot>::LAYOUT,
+                shift: <$dot as Dot>::SHIFT,
+                tiles: [tiles::<1>(), tiles::<2>()],
+                quantise,
+            };
+        }
+        use $module::EIGHT as $eight;
     };
     // Rows above the tile's height are never asked for.
     (@rows 12, $nv:ident) => {
@@ -197,10 +237,43 @@ macro_rules! table {
     };
 }
 
-table!(SCALAR, scalar, Scalar, 4, ());
+table!(@eight SCALAR_BYTES, scalar_bytes, ScalarDot, 4, ());
+table!(SCALAR, scalar, Scalar, 4, (), SCALAR_BYTES);
 #[cfg(target_arch = "x86_64")]
-table!(AVX2, avx2, x86::Avx2, 6, ("avx2,fma"));
+table!(@eight WIDE256, avx2_wide, x86::Wide256, 4, ("avx2,fma"));
 #[cfg(target_arch = "x86_64")]
-table!(AVX512, avx512, x86::Avx512, 12, ("avx512f"));
+table!(@eight VNNI256, avx_vnni, x86::Vnni256, 6, ("avx2,fma,avxvnni"));
+#[cfg(target_arch = "x86_64")]
+table!(@eight VNNI512, avx512_vnni, x86::Vnni512, 12, ("avx512f,avx512vnni"));
+#[cfg(target_arch = "x86_64")]
+table!(AVX2, avx2, x86::Avx2, 6, ("avx2,fma"), WIDE256);
+#[cfg(target_arch = "x86_64")]
+table!(AVX512, avx512, x86::Avx512, 12, ("avx512f"), WIDE256);
+#[cfg(target_arch = "x86_64")]
+static AVX2_VNNI: Kernels = Kernels { eight: VNNI256, ..avx2::TABLE };
+#[cfg(target_arch = "x86_64")]
+static AVX512_VNNI: Kernels = Kernels { eight: VNNI512, ..avx512::TABLE };
 #[cfg(target_arch = "aarch64")]
-table!(NEON, neon_table, neon::Neon, 8, ("neon"));
+table!(@eight NEON_WIDE, neon_wide, neon::Wide, 8, ("neon"));
+#[cfg(target_arch = "aarch64")]
+table!(@eight NEON_DOTPROD, neon_dotprod, neon::DotProd, 8, ("neon,dotprod"));
+#[cfg(target_arch = "aarch64")]
+table!(NEON, neon_table, neon::Neon, 8, ("neon"), NEON_WIDE);
+#[cfg(target_arch = "aarch64")]
+static NEON_DOT: Kernels = Kernels { eight: NEON_DOTPROD, ..neon_table::TABLE };
+
+/// Tables of this processor that [`Isa::kernels`] passes over because it has a better one.
+#[cfg(test)]
+pub fn passed_over() -> Vec<(String, &'static Kernels)> {
+    let mut found: Vec<(String, &'static Kernels)> = Vec::new();
+    #[cfg(target_arch = "x86_64")]
+    if Isa::Avx2.kernels().is_some() {
+        found.push(("Avx2 without VNNI".into(), &AVX2));
+        if Isa::Avx512.kernels().is_some() {
+            found.push(("Avx512 without VNNI".into(), &AVX512));
+        }
+    }
+    #[cfg(target_arch = "aarch64")]
+    found.push(("Neon without dotprod".into(), &NEON));
+    found
+}

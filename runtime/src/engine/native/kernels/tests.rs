@@ -1,6 +1,8 @@
 //! Every kernel, with every instruction set of this processor and several threads, against loops
 //! written out, over odd sizes, strides and alignments.
 
+mod eight;
+
 use super::*;
 use crate::engine::native::graph::{Binary, Reduce, Unary};
 use proptest::prelude::*;
@@ -121,6 +123,7 @@ proptest! {
                 clamp: if with == 3 { (0.0, 6.0) } else { (f32::NEG_INFINITY, f32::INFINITY) },
                 halo: (halo > 0).then_some(border),
                 block: 1 + gap * 8,
+                scales: None,
             });
             (step, weights)
         };

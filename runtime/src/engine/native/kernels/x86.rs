@@ -1,7 +1,11 @@
 //! AVX2 with FMA, and AVX-512.
 
+mod dot;
+
 use super::simd::Simd;
 use core::arch::x86_64::*;
+
+pub use dot::{Vnni256, Vnni512, Wide256};
 
 /// Eight floats; needs `avx2` and `fma`.
 #[derive(Clone, Copy)]

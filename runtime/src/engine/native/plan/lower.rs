@@ -1,5 +1,6 @@
 //! One graph, node by node: each one becomes a view, or steps that write a new buffer.
 
+mod bytes;
 mod products;
 
 use super::super::graph::{Binary, Graph, GraphError, Node, Op, Reduce, Unary, Window};
@@ -37,6 +38,7 @@ pub fn lower(
         graph,
         views: vec![None; graph.values.len()],
         halo,
+        bytes: vec![None; graph.values.len()],
         steps: Vec::new(),
         nodes: Vec::new(),
         buffers: Vec::new(),
@@ -57,6 +59,8 @@ struct Lower<'p, 'g, 'a> {
     graph: &'g Graph<'a>,
     /// Of every value that is no constant, once it is known.
     views: Vec<Option<View>>,
+    /// Values that products take as bytes.
+    bytes: Vec<Option<bytes::Bytes>>,
     /// Border that the convolutions after a value want.
     halo: Vec<usize>,
     steps: Vec<Step>,
@@ -152,6 +156,7 @@ impl Lower<'_, '_, '_> {
             Op::Slice { axis, start, step } => x.sliced(*axis, *start, *step, shape[*axis]),
             Op::Expand => x.expanded(&shape),
             Op::Concat(axis) => self.concat(node, *axis, &shape)?,
+            Op::Unary(Unary::Round { scale, zero }) => self.round(node, &x, *scale, *zero)?,
             Op::Unary(op) => self.unary(*op, &x, node.output)?,
             Op::Binary(op) => {
                 let y = self.view(node.inputs[1]);

@@ -15,6 +15,7 @@ use super::kernels::{Halo, Kernels, Program, Step};
 use crate::system::Mapping;
 use arena::Life;
 use std::collections::HashMap;
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::sync::Arc;
 pub use view::{Base, View};
 
@@ -30,6 +31,8 @@ type Result<T> = core::result::Result<T, GraphError>;
 enum Source {
     /// Bytes of the bundle, which graphs share.
     Bytes(usize, usize),
+    /// Bytes of the bundle that are scaled, with a hash of the scales.
+    Scaled(usize, usize, u64),
     /// A value that the reader made.
     Value(usize, usize),
 }
@@ -43,6 +46,12 @@ enum Made {
     Packed(Source, usize, Vec<usize>, Vec<usize>),
     /// Padded to whole vectors.
     Padded(Source, usize),
+    /// Bytes packed for products.
+    Bytes(Source, Vec<usize>),
+    /// Factors of the columns of a product of bytes, for this step of the activations (as bits).
+    Scales(Source, u32),
+    /// What is added to such a product: its bias and the share of this zero point.
+    Offsets(Source, Option<Source>, u32, u8),
 }
 
 /// Where inputs and outputs of graphs are.
@@ -300,7 +309,14 @@ fn lives(routine: &Routine, kernels: &'static Kernels, threads: usize) -> Result
 /// Source of a constant of the graph with this index.
 fn source(graph: usize, value: usize, data: &Data<'_>) -> Source {
     match data {
-        Data::Bytes(bytes) => Source::Bytes(bytes.as_ptr().addr(), bytes.len()),
+        Data::Bytes(bytes) | Data::Halves(bytes) => {
+            Source::Bytes(bytes.as_ptr().addr(), bytes.len())
+        }
+        Data::Scaled { bytes, scale, .. } => {
+            let mut hasher = DefaultHasher::new();
+            scale.iter().for_each(|s| s.to_bits().hash(&mut hasher));
+            Source::Scaled(bytes.as_ptr().addr(), bytes.len(), hasher.finish())
+        }
         _ => Source::Value(graph, value),
     }
 }

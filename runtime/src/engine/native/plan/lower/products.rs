@@ -2,11 +2,12 @@
 
 use super::super::super::graph::{Node, Post, Window};
 use super::super::super::kernels::{
-    Attention, Depthwise, Gemm, MatMul, PackKv, Pitch, Place, Step, ThinAttention,
+    Attention, Depthwise, Eight, Gemm, MatMul, PackKv, Pitch, Place, Step, ThinAttention,
 };
 use super::super::rows::{offsets, rows};
 use super::super::view::{Base, View};
 use super::super::{Made, gather};
+use super::bytes::Operands;
 use super::{Lower, TOO_MANY, Try, address, four};
 
 /// Floats of input and output rows that stay in the second-level cache beside a panel of weights.
@@ -26,7 +27,13 @@ impl Lower<'_, '_, '_> {
         let weights = node.inputs[1];
         let [_, channels, _, _] = four(&x.shape)?;
         let [n, per_group, kh, kw] = four(self.graph.shape(weights))?;
-        let source = self.map_source(&x, window.halo())?;
+        let bytes = self.byte_input(node);
+        let source = match &bytes {
+            Some(bytes) => bytes.source(),
+            None => self.map_source(&x, window.halo())?,
+        };
+        // Places of floats that a pixel takes.
+        let depth = if bytes.is_some() { Eight::floats(per_group) } else { per_group };
         let target = self.map_target(node.output)?;
         let [_, _, oh, ow] = four(&target.view.shape)?;
         let pitch = source.pitch;
@@ -43,7 +50,8 @@ impl Lower<'_, '_, '_> {
             .flat_map(|y| (0..kw).map(move |x| y + x * window.dilation[1] * pitch.x))
             .collect();
 
-        if group == channels && n == channels && per_group == 1 && post.residual.is_none() {
+        let own = group == channels && n == channels && per_group == 1;
+        if own && post.residual.is_none() && bytes.is_none() {
             let (data, from) = self.constant(weights)?;
             let (shape, order) = ([kh * kw, n], [1, kh * kw]);
             let made = Made::Copy(from, 0, shape.into(), order.into());
@@ -74,14 +82,14 @@ impl Lower<'_, '_, '_> {
             None => None,
         };
         // The pixels of a window's line are one run when nothing lies between them.
-        let joined = group == 1 && pitch.x == channels && window.dilation[1] == 1;
+        let joined = group == 1 && pitch.x == depth && window.dilation[1] == 1;
         let (taps, run): (Box<[usize]>, usize) =
-            if joined { (lines.collect(), kw * channels) } else { (taps, per_group) };
+            if joined { (lines.collect(), kw * depth) } else { (taps, depth) };
         let footprint = pitch.x * window.stride[0] * window.stride[1];
         let columns = n / group;
         for g in 0..group {
-            let packed = self.pack_kernel(weights, g * columns, columns)?;
             let bias = match (post.bias, group) {
+                _ if bytes.is_some() => None,
                 (bias, 1) => self.channels(bias, n, true)?,
                 (None, _) => None,
                 (Some(id), _) => {
@@ -93,6 +101,13 @@ impl Lower<'_, '_, '_> {
                         part.resize(len, 0.0);
                         part
                     }))
+                }
+            };
+            let Operands { weights, bias, scales } = match &bytes {
+                Some(input) => self.byte_operands(input, weights, post)?,
+                None => {
+                    let weights = self.pack_kernel(weights, g * columns, columns)?;
+                    Operands { weights, bias, scales: None }
                 }
             };
             let input = match start {
@@ -109,8 +124,9 @@ impl Lower<'_, '_, '_> {
                 input_pitch: stride,
                 taps: taps.clone(),
                 run,
-                weights: packed,
+                weights,
                 bias,
+                scales,
                 columns,
                 output: target.output + g * columns,
                 output_pitch: target.pitch,
@@ -148,17 +164,32 @@ impl Lower<'_, '_, '_> {
     pub(super) fn matmul(&mut self, node: &Node, post: &Post) -> Try<View> {
         let (a, b) = (self.view(node.inputs[0]), self.view(node.inputs[1]));
         let shape = self.graph.shape(node.output).to_vec();
+        if let Some(bytes) = self.byte_input(node) {
+            let operands = self.byte_operands(&bytes, node.inputs[1], post)?;
+            let size = [Eight::floats(b.shape[0]), b.shape[1]];
+            return self.linear(&bytes.view, operands, size, &shape, post);
+        }
         if matches!(b.base, Base::Constant(_)) {
             if b.shape.len() == 2 {
-                return self.linear(&a, &b, &shape, post);
+                let weights = self.pack_matrix(&b)?;
+                let bias = self.channels(post.bias, b.shape[1], true)?;
+                let operands = Operands { weights, bias, scales: None };
+                return self.linear(&a, operands, [b.shape[0], b.shape[1]], &shape, post);
             }
             return self.linear_batch(&a, &b, &shape);
         }
         self.product(&a, &b, &shape)
     }
 
-    /// A tensor times a constant matrix.
-    fn linear(&mut self, a: &View, b: &View, shape: &[usize], post: &Post) -> Try<View> {
+    /// A tensor times a constant matrix of `depth` rows.
+    fn linear(
+        &mut self,
+        a: &View,
+        operands: Operands,
+        [depth, columns]: [usize; 2],
+        shape: &[usize],
+        post: &Post,
+    ) -> Try<View> {
         let mut a = self.runs(a)?;
         let to = self.matrix(shape);
         let mut residual = match post.residual {
@@ -180,16 +211,15 @@ impl Lower<'_, '_, '_> {
             residual = residual.map(|r| self.whole(&r)).transpose()?;
         }
         let rows = joined(&a, &residual).ok_or(TOO_MANY)?;
-        let columns = b.shape[1];
-        let weights = self.pack_matrix(b)?;
-        let bias = self.channels(post.bias, columns, true)?;
+        let Operands { weights, bias, scales } = operands;
         let residual = match &residual {
             Some(r) => Some((self.place(r.base, r.offset)?, rows.pitch[2])),
             None => None,
         };
-        self.gemm(&a, rows.size, (rows.pitch[0], rows.pitch[1]), b.shape[0], &to, |gemm| Gemm {
+        self.gemm(&a, rows.size, (rows.pitch[0], rows.pitch[1]), depth, &to, |gemm| Gemm {
             weights,
             bias,
+            scales,
             columns,
             residual,
             clamp: post.clamp,
@@ -222,6 +252,7 @@ impl Lower<'_, '_, '_> {
             clamp: (f32::NEG_INFINITY, f32::INFINITY),
             halo: None,
             block: BLOCK / depth.max(1),
+            scales: None,
         };
         self.push(Step::Gemm(rest(gemm)));
         Ok(())

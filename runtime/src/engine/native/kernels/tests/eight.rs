@@ -1,0 +1,166 @@
+//! Products of bytes: exact against loops in integers, with every instruction set.
+
+use super::super::eight::BYTES;
+use super::*;
+
+/// Tables for bytes that [`Isa::kernels`] did not choose are tested too.
+fn all_tables() -> Vec<(String, &'static Kernels)> {
+    let chosen = tables().into_iter().map(|(isa, k)| (format!("{isa:?}"), k));
+    chosen.chain(super::super::table::passed_over()).collect()
+}
+
+/// A byte that is the same on every run; extremes are frequent.
+fn byte(i: usize, seed: usize) -> u8 {
+    match (i * 31 + seed * 17) % 7 {
+        0 => 255,
+        1 => 0,
+        _ => ((i * 7919 + seed * 104_729) % 251) as u8,
+    }
+}
+
+/// Bytes in the places of floats, every pixel in `groups` of them.
+fn packed(pixels: usize, channels: usize, pixel: usize, seed: usize) -> Vec<f32> {
+    let mut floats = Vec::new();
+    for p in 0..pixels {
+        for group in 0..pixel {
+            let four: [u8; BYTES] = std::array::from_fn(|k| {
+                let c = group * BYTES + k;
+                // What lies behind the channels must not matter.
+                if c < channels { byte(p * channels + c, seed) } else { 0xa5 }
+            });
+            floats.push(f32::from_bits(u32::from_ne_bytes(four)));
+        }
+    }
+    floats
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
+
+    #[test]
+    fn products_of_bytes(
+        (h, w, c, n) in (1usize..6, 1usize..9, 1usize..23, 1usize..71),
+        (kernel, stride) in (prop::sample::select(vec![1usize, 3]), 1usize..3),
+        (gap, with, threads) in (0usize..3, 0usize..4, 1usize..4),
+    ) {
+        let pad = kernel / 2;
+        let (ih, iw) = (h + 2 * pad, w + 2 * pad);
+        let (oh, ow) = ((ih - kernel) / stride + 1, (iw - kernel) / stride + 1);
+        let groups = Eight::floats(c);
+        let (pixel, line) = (groups + gap, iw * (groups + gap));
+        let input = packed(ih * iw, c, pixel, 1);
+        let residual = numbers(oh * ow * n, 2);
+        let output = input.len() + residual.len() + 5;
+        let area = kernel * kernel;
+        let weight = |tap: usize, channel: usize, column: usize| {
+            byte((tap * c + channel) * n + column, 3).cast_signed()
+        };
+        let scales: Vec<f32> = (0..n).map(|j| 1e-4 * (1 + j % 5) as f32).collect();
+        let bias = numbers(n, 4);
+        let zero = 77;
+        let clamp = if with == 3 { (0.0, 6.0) } else { (f32::NEG_INFINITY, f32::INFINITY) };
+        for (name, k) in all_tables() {
+            let eight = &k.eight;
+            let columns = eight.packing.columns(n);
+            let depth = groups * BYTES;
+            let mut weights = vec![0.0; 5];
+            let at = |row: usize, column: usize| {
+                if row % depth < c { weight(row / depth, row % depth, column) } else { 0 }
+            };
+            eight.pack(area * groups, n, at, &mut weights);
+            prop_assert_eq!(weights.len(), 5 + eight.packing.len(area * groups, n));
+            let scales_at = weights.len();
+            weights.extend(&scales);
+            weights.resize(scales_at + columns, 0.0);
+            let bias_at = weights.len();
+            weights.extend((0..n).map(|j| {
+                let all = (0..area).flat_map(|t| (0..c).map(move |i| (t, i)));
+                let sum: i32 = all.map(|(t, i)| i32::from(weight(t, i, j))).sum();
+                bias[j] - (zero - eight.shift) as f32 * scales[j] * sum as f32
+            }));
+            weights.resize(bias_at + columns, 0.0);
+            let residual_at = (Place::Arena(input.len()), Pitch { y: ow * n, x: n });
+            let step = Step::Gemm(Gemm {
+                size: [oh, ow],
+                input: Place::Arena(0),
+                input_pitch: Pitch { y: stride * line, x: stride * pixel },
+                taps: (0..area).map(|t| t / kernel * line + t % kernel * pixel).collect(),
+                run: groups,
+                weights: 5,
+                bias: Some(bias_at),
+                columns: n,
+                output,
+                output_pitch: Pitch { y: ow * n, x: n },
+                residual: (with & 2 == 2).then_some(residual_at),
+                clamp,
+                halo: None,
+                block: 1 + gap * 8,
+                scales: Some(scales_at),
+            });
+            let mut start = input.clone();
+            start.extend(&residual);
+            let end = output + oh * ow * n;
+            let found = run(&step, k, threads, &start, end + 3, &weights);
+            for i in 0..oh * ow * n {
+                let (y, x, j) = (i / n / ow, i / n % ow, i % n);
+                let mut sum = 0;
+                for (t, channel) in (0..area).flat_map(|t| (0..c).map(move |i| (t, i))) {
+                    let p = (y * stride + t / kernel) * iw + x * stride + t % kernel;
+                    let a = i32::from(byte(p * c + channel, 1)) - zero;
+                    sum += a * i32::from(weight(t, channel, j));
+                }
+                let add = if with & 2 == 2 { residual[i] } else { 0.0 };
+                let want = (sum as f32 * scales[j] + bias[j] + add).clamp(clamp.0, clamp.1);
+                let v = found[output + i];
+                let room = 1e-6 * scales[j] * (area * c) as f32 * 65_000.0;
+                prop_assert!((v - want).abs() <= room + 1e-5, "{name}: {v}, not {want} at {i}");
+            }
+            prop_assert_eq!(&found[end..], &[UNTOUCHED; 3][..]);
+            prop_assert_eq!(found[output - 1], UNTOUCHED);
+        }
+    }
+
+    #[test]
+    fn floats_to_bytes(
+        (h, w, c, halo) in (1usize..5, 1usize..6, 1usize..40, 0usize..2),
+        (zero, threads) in (0u8..=255, 1usize..4),
+    ) {
+        let input: Vec<f32> = numbers(h * w * c, 1).iter().map(|x| x * 20.0).collect();
+        let pixel = Eight::floats(c);
+        let line = (w + 2 * halo) * pixel;
+        let start = input.len();
+        let border = Halo { start, size: [h, w], width: halo, line, pixel };
+        let arena = start + border.len();
+        for (name, k) in all_tables() {
+            let step = Step::Quantise(Quantise {
+                size: [h, w],
+                channels: c,
+                input: Place::Arena(0),
+                input_pitch: Pitch { y: w * c, x: c },
+                output: start + halo * (line + pixel),
+                output_pitch: Pitch { y: line, x: pixel },
+                factor: 4.0,
+                zero,
+                halo: (halo > 0).then_some(border),
+            });
+            let found = run(&step, k, threads, &input, arena, &[0.0]);
+            for (i, v) in found[start..].iter().enumerate() {
+                let (y, x, group) = (i / line, i % line / pixel, i % pixel);
+                let inside = (halo..h + halo).contains(&y) && (halo..w + halo).contains(&x);
+                for (k, b) in v.to_bits().to_ne_bytes().into_iter().enumerate() {
+                    let channel = group * BYTES + k;
+                    if inside && channel >= c {
+                        continue;
+                    }
+                    let want = if inside {
+                        let x = input[((y - halo) * w + x - halo) * c + channel];
+                        ((x * 4.0).round_ties_even() + f32::from(zero)).clamp(0.0, 255.0) as u8
+                    } else {
+                        zero
+                    };
+                    prop_assert_eq!(b, want, "{} at {}, byte {}", name, i, k);
+                }
+            }
+        }
+    }
+}
