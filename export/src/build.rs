@@ -9,7 +9,7 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use tsda_runtime::bundle::{Figure, Manifest, Provenance, SectionKind, TrainedOn, crc32};
 use tsda_runtime::probe::{self, ProbeError};
-use tsda_runtime::{ModelSpec, SpecError, TrackerParams};
+use tsda_runtime::{ModelSpec, MotionPrior, SpecError, TrackerParams};
 use tsda_trainer::burn_engine::BurnEngine;
 use tsda_trainer::config::{ConfigError, Experiment};
 use tsda_trainer::import::{self, Given, Metadata, Source, WeightsError, WeightsFile};
@@ -42,6 +42,8 @@ pub struct BuildOptions {
     pub licence: String,
     /// Sensors the weights have seen, when no configuration tells.
     pub trained_on: TrainedOn,
+    /// What the tracker takes the last frame to say about the next one.
+    pub motion: Option<MotionPrior>,
 }
 
 /// A bundle that could not be built. Nothing has been written then.
@@ -255,6 +257,7 @@ pub fn build(options: &BuildOptions) -> Result<BuildReport, BuildError> {
         card: &card,
         sections: Default::default(),
         precision: None,
+        motion: options.motion,
     };
     let bundle = bundle::write(&options.out, &manifest, &sections)?;
     Ok(BuildReport {

@@ -19,9 +19,9 @@ use tsda_export::macs::{self, MacsReport};
 use tsda_export::network;
 use tsda_export::quantize::QuantizeOptions;
 use tsda_export::unpack::unpack;
-use tsda_runtime::ModelSpec;
 use tsda_runtime::bundle::{BundleFile, Numbers, TrainedOn};
 use tsda_runtime::engine::EngineChoice;
+use tsda_runtime::{ModelSpec, MotionPrior};
 
 /// Turns trained weights into bundles that run on a board, and checks them.
 #[derive(Parser)]
@@ -48,6 +48,11 @@ enum Command {
         /// Sensors imported weights have seen: "rgb", "thermal", "cross-modal", separated by commas.
         #[arg(long, value_delimiter = ',', conflicts_with = "config")]
         trained_on: Vec<Sensor>,
+        /// What the tracker takes the last frame to say about the next one: share of a score that
+        /// depends on the distance from where the target was, share of a change of size taken over
+        /// at once. Nothing by default, as in the reference.
+        #[arg(long, value_name = "WINDOW,SIZE_RATE")]
+        motion: Option<MotionPrior>,
         /// The bundle to write.
         #[arg(long)]
         out: PathBuf,
@@ -148,6 +153,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
             config,
             preset,
             trained_on,
+            motion,
             out,
             name,
             card,
@@ -172,6 +178,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
                 data_sources,
                 licence,
                 trained_on,
+                motion,
             };
             let report = build(&options)?;
             for (kind, recorded, written) in &report.graphs {

@@ -36,6 +36,7 @@ fn options(weights: &Path, out: &Path, preset: Option<&str>) -> BuildOptions {
         data_sources: None,
         licence: "see the original".into(),
         trained_on: RGB,
+        motion: None,
     }
 }
 

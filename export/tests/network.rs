@@ -50,6 +50,7 @@ fn random_bundle(name: &str, spec: &ModelSpec) -> (Vec<u8>, usize) {
         spec: *spec,
         tracker: TrackerParams::default(),
         trained_on: TrainedOn::default(),
+        motion: None,
         calibration: None,
         provenance: Provenance::default(),
         figures: Default::default(),
@@ -119,6 +120,7 @@ fn inputs(dir: &Path, spec: &ModelSpec) -> BuildOptions {
         figures: Some(dir.join("f.json")),
         data_sources: Some(dir.join("d.txt")),
         licence: "CC0-1.0".into(),
+        motion: None,
         trained_on: TrainedOn::default(),
     }
 }

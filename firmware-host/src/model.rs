@@ -39,7 +39,7 @@ pub fn tracker(file: &BundleFile) -> Result<Tracker<AnyEngine>, HostError> {
     tracker_on(file, &EngineChoice::default())
 }
 
-/// A tracker on an engine, with the thresholds and the calibration of the bundle.
+/// A tracker on an engine, with the thresholds, calibration and motion prior of the bundle.
 ///
 /// # Errors
 /// When the engine is not there on this machine or cannot be built from the bundle's graphs.
@@ -53,6 +53,7 @@ pub fn tracker_on(
     let mut tracker =
         Tracker::new(engine(file, &bundle, choice)?, manifest.tracker).map_err(failed)?;
     tracker.set_calibration(manifest.calibration).map_err(|e| failed(e.into()))?;
+    tracker.set_motion_prior(manifest.motion).map_err(|e| failed(e.into()))?;
     Ok(tracker)
 }
 

@@ -1,11 +1,27 @@
-//! Whether the frame is scanned for a lost target: arguments shared by the commands that track.
+//! How the tracker searches, where that differs from the bundle: arguments shared by the commands
+//! that track.
 
 use crate::error::HostError;
 use clap::Args;
 use std::fmt;
-use tsda_runtime::{RedetectOptions, Tracker};
+use tsda_runtime::{MotionPrior, RedetectOptions, Tracker};
 
-/// `--scan-when-lost` and `--scan-threshold`.
+/// A motion prior as typed, or `off`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MotionChoice(pub Option<MotionPrior>);
+
+impl std::str::FromStr for MotionChoice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "off" {
+            return Ok(Self(None));
+        }
+        text.parse().map(|prior| Self(Some(prior))).map_err(|e: &str| format!("{e}; or off"))
+    }
+}
+
+/// `--scan-when-lost`, `--scan-threshold` and `--motion`.
 #[derive(Clone, Copy, Debug, Default, Args)]
 pub struct RedetectArgs {
     /// Look over the whole frame for a target that is lost, N search areas more per frame (the cost
@@ -16,6 +32,10 @@ pub struct RedetectArgs {
     /// Score above which a find of the scan counts [default: 0.8]
     #[arg(long, value_name = "SCORE", requires = "scan_when_lost")]
     pub scan_threshold: Option<f32>,
+    /// How much place and size of the last frame count: share of a score that depends on the
+    /// distance from there, share of a change of size taken over at once [default: the bundle's]
+    #[arg(long, value_name = "WINDOW,SIZE_RATE|off")]
+    pub motion: Option<MotionChoice>,
 }
 
 impl RedetectArgs {
@@ -41,6 +61,12 @@ impl RedetectArgs {
     /// # Errors
     /// When the threshold is out of range.
     pub fn apply<E>(&self, tracker: &mut Tracker<E>) -> Result<(), HostError> {
+        if let Some(MotionChoice(motion)) = self.motion {
+            tracker.set_motion_prior(motion).map_err(|e| HostError::Argument {
+                what: "--motion".into(),
+                reason: e.to_string(),
+            })?;
+        }
         tracker.set_redetection(self.options()).map_err(out_of_range)
     }
 }
@@ -52,10 +78,20 @@ fn out_of_range(e: impl fmt::Display) -> HostError {
 /// What sets results apart from those without the options; empty without them.
 impl fmt::Display for RedetectArgs {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Some(options) = self.options() else { return Ok(()) };
-        // As JSON, which has every field there is.
-        let json = serde_json::to_string(&options).map_err(|_| fmt::Error)?;
-        write!(f, "scan {json}")
+        if let Some(options) = self.options() {
+            // As JSON, which has every field there is.
+            let json = serde_json::to_string(&options).map_err(|_| fmt::Error)?;
+            write!(f, "scan {json}")?;
+        }
+        match self.motion {
+            None => return Ok(()),
+            Some(_) if self.options().is_some() => f.write_str(", motion ")?,
+            Some(_) => f.write_str("motion ")?,
+        }
+        match self.motion.and_then(|m| m.0) {
+            None => f.write_str("off"),
+            Some(prior) => prior.fmt(f),
+        }
     }
 }
 
@@ -89,6 +125,12 @@ mod tests {
             text(&["--scan-when-lost=5", "--scan-threshold", "0.9"]),
             "scan {\"positions_per_frame\":5,\"threshold\":0.9}"
         );
+        assert_eq!(text(&["--motion", "0.3,1"]), "motion 0.3,1");
+        assert_eq!(
+            text(&["--scan-when-lost=2", "--motion=off"]),
+            "scan {\"positions_per_frame\":2,\"threshold\":0.8}, motion off"
+        );
+        assert!(parse(&["--motion", "1.5,1"]).is_err() && parse(&["--motion", "0.3"]).is_err());
         assert!(parse(&["--scan-threshold", "0.8"]).is_err());
         assert!(parse(&["--scan-when-lost=0"]).is_err());
     }

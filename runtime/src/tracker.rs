@@ -259,7 +259,7 @@ impl<E: Engine> Tracker<E> {
         let cell_size = sample_scale * ModelSpec::STRIDE as f32;
         let previous =
             Yx::new((pos.y - sample_pos.y) / cell_size, (pos.x - sample_pos.x) / cell_size);
-        let motion = motion.unwrap_or(MotionPrior { window: 0.0, size_rate: 1.0 });
+        let motion = motion.unwrap_or(MotionPrior::OFF);
         let located = localise_weighted(
             maps.scores,
             spec.map_side(),

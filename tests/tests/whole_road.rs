@@ -92,6 +92,7 @@ fn bundle_of(weights: PathBuf, run: &Path, out: &Path) {
         data_sources: None,
         licence: "none".into(),
         trained_on: Default::default(),
+        motion: None,
     })
     .unwrap();
 }

@@ -119,6 +119,9 @@ fn describe(path: &str, bundle: &Bundle<'_>) -> String {
             p.not_found, p.write_confidence, p.lost_after
         ),
     );
+    if let Some(motion) = m.motion {
+        row("motion prior", format!("window {}, size rate {}", motion.window, motion.size_rate));
+    }
     if let Some(c) = m.calibration {
         row("calibration", format!("slope {}, bias {}", c.slope, c.bias));
     }

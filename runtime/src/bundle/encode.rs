@@ -1,5 +1,6 @@
 //! Putting a bundle together.
 
+use super::manifest::Trailer;
 use super::{
     Bundle, BundleError, HEADER_LEN, Manifest, PLAIN_VERSION, Section, SectionKind, VERSION,
     align_up, crc32, header_of,
@@ -33,20 +34,22 @@ pub fn encode(
     let mut manifest = manifest.clone();
     // Offsets follow the manifest, whose length depends on the digits of the offsets: leave more
     // room until it fits. Offsets grow with the room and have at most ten bytes each, so this ends.
+    let trailer = (manifest.precision.is_some() || manifest.motion.is_some())
+        .then(|| Trailer { precision: manifest.precision.clone(), motion: manifest.motion });
     let mut room = 0;
     let encoded = loop {
         place(&mut manifest, sections, room)?;
         let failed = |e: postcard::Error| EncodeError::Manifest(e.to_string());
         let mut encoded = postcard::to_stdvec(&manifest).map_err(failed)?;
-        if let Some(precision) = &manifest.precision {
-            encoded.extend(postcard::to_stdvec(precision).map_err(failed)?);
+        if let Some(trailer) = &trailer {
+            encoded.extend(postcard::to_stdvec(trailer).map_err(failed)?);
         }
         if encoded.len() <= room {
             break encoded;
         }
         room = encoded.len();
     };
-    let version = if manifest.precision.is_some() { VERSION } else { PLAIN_VERSION };
+    let version = if trailer.is_some() { VERSION } else { PLAIN_VERSION };
     let head = header_of(version, &encoded)
         .ok_or_else(|| EncodeError::Manifest("it is longer than 4 GiB".into()))?;
     let mut bytes = head.to_vec();

@@ -1,6 +1,7 @@
 //! What a bundle says about itself.
 
 use crate::spec::{ModelSpec, SpecError, TrackerParams};
+use crate::tracker::MotionPrior;
 use serde::{Deserialize, Serialize};
 
 /// The manifest: borrowed from the file's bytes, no allocation.
@@ -31,6 +32,18 @@ pub struct Manifest<'a> {
     /// throughout. Stands behind the rest of the manifest, in files of format version 2.
     #[serde(skip)]
     pub precision: Option<Precision<'a>>,
+    /// What the last frame says about the next one, when the model was tuned with such a prior.
+    /// Stands where [`Self::precision`] does.
+    #[serde(skip)]
+    pub motion: Option<MotionPrior>,
+}
+
+/// What a file of format version 2 has behind the manifest of version 1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Trailer<'a> {
+    #[serde(borrow)]
+    pub precision: Option<Precision<'a>>,
+    pub motion: Option<MotionPrior>,
 }
 
 /// Narrow numbers.

@@ -37,10 +37,10 @@ use crate::spec::SpecError;
 /// First eight bytes of every bundle. Line-ending and end-of-file bytes in it catch text-mode
 /// transfers.
 pub const MAGIC: [u8; 8] = *b"TSDA\r\n\x1a\n";
-/// The newest format version this crate reads. Bundles without a [`Precision`] are written as
-/// version 1, which older programs read too.
+/// The newest format version this crate reads. Bundles with neither a [`Precision`] nor a
+/// [`MotionPrior`](crate::MotionPrior) are written as version 1, which older programs read too.
 pub const VERSION: u32 = 2;
-/// The version of bundles without a [`Precision`].
+/// The version of bundles without either.
 pub const PLAIN_VERSION: u32 = 1;
 /// Bytes before the manifest.
 pub const HEADER_LEN: usize = 24;
@@ -226,9 +226,10 @@ impl<'a> Bundle<'a> {
         let (mut manifest, mut unread): (Manifest<'a>, _) =
             postcard::take_from_bytes(raw).map_err(BundleError::Decode)?;
         if version > PLAIN_VERSION {
-            let (precision, rest) =
+            let (trailer, rest): (manifest::Trailer<'a>, _) =
                 postcard::take_from_bytes(unread).map_err(BundleError::Decode)?;
-            (manifest.precision, unread) = (Some(precision), rest);
+            (manifest.precision, manifest.motion) = (trailer.precision, trailer.motion);
+            unread = rest;
         }
         if !unread.is_empty() {
             return Err(BundleError::Decode(postcard::Error::SerdeDeCustom));
@@ -237,6 +238,9 @@ impl<'a> Bundle<'a> {
         manifest.tracker.validate()?;
         if let Some(calibration) = &manifest.calibration {
             calibration.validate()?;
+        }
+        if let Some(motion) = &manifest.motion {
+            motion.validate()?;
         }
         check_sections(bytes, &manifest.sections, manifest_end)?;
         Ok(Self {

@@ -1,5 +1,6 @@
 use super::*;
 use crate::spec::{ModelSpec, TrackerParams};
+use crate::tracker::MotionPrior;
 use proptest::prelude::*;
 
 fn manifest<'a>() -> Manifest<'a> {
@@ -15,6 +16,7 @@ fn manifest<'a>() -> Manifest<'a> {
         card: "# card",
         sections: heapless::Vec::new(),
         precision: None,
+        motion: None,
     }
 }
 
@@ -234,7 +236,7 @@ fn precision<'a>() -> Precision<'a> {
 }
 
 #[test]
-fn a_precision_stands_behind_the_manifest() {
+fn precision_and_motion_stand_behind_the_manifest() {
     let narrow = Manifest { precision: Some(precision()), ..manifest() };
     let bytes = encode(&narrow, &SECTIONS).unwrap();
     assert_eq!(bytes[8], 2, "older programs must not take it for a network of floats");
@@ -250,6 +252,15 @@ fn a_precision_stands_behind_the_manifest() {
         assert!(Bundle::parse(&other).is_err(), "byte {at}");
         assert!(Bundle::parse(&bytes[..at]).is_err(), "cut at {at}");
     }
+    let motion = Some(MotionPrior { window: 0.3, size_rate: 0.5 });
+    for precision in [None, Some(precision())] {
+        let bytes = encode(&Manifest { precision, motion, ..manifest() }, &SECTIONS).unwrap();
+        assert_eq!(bytes[8], 2);
+        assert_eq!(Bundle::parse(&bytes).unwrap().manifest().motion, motion);
+    }
+    let wide = Some(MotionPrior { window: 2.0, size_rate: 0.5 });
+    let error = encode(&Manifest { motion: wide, ..manifest() }, &SECTIONS).unwrap_err();
+    assert!(error.to_string().contains("motion.window"), "{error}");
     // Bundles without one stay what older programs read.
     let plain = encode(&manifest(), &SECTIONS).unwrap();
     assert_eq!(plain[8], 1);

@@ -41,6 +41,9 @@ impl MotionPrior {
         Ok(())
     }
 
+    /// Neither figure has an effect.
+    pub const OFF: Self = Self { window: 0.0, size_rate: 1.0 };
+
     /// Factor of a cell's score; `previous` is the target's offset from the middle of the map
     /// `(side, side)` in cells before this frame.
     pub(super) fn weight(
@@ -48,7 +51,7 @@ impl MotionPrior {
         target: &Target,
         side: usize,
         previous: Yx,
-    ) -> impl Fn(usize, usize) -> f32 + Copy {
+    ) -> impl Fn(usize, usize) -> f32 + Copy + use<> {
         // Every frame without the target is one more it may have moved in.
         let window = self.window / (1.0 + target.missing() as f32);
         let half = side as f32 * 0.5;
@@ -74,6 +77,26 @@ impl MotionPrior {
         let w = size.x + self.size_rate * (found.w - size.x);
         let h = size.y + self.size_rate * (found.h - size.y);
         BBox::new(found.x + (found.w - w) * 0.5, found.y + (found.h - h) * 0.5, w, h)
+    }
+}
+
+/// `WINDOW,SIZE_RATE`, for example `0.3,1`.
+impl core::str::FromStr for MotionPrior {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let wanted = "two numbers are wanted, WINDOW,SIZE_RATE, for example 0.3,1";
+        let (window, size_rate) = text.split_once(',').ok_or(wanted)?;
+        let number = |text: &str| text.trim().parse::<f32>().map_err(|_| wanted);
+        let prior = Self { window: number(window)?, size_rate: number(size_rate)? };
+        prior.validate().map_err(|e| e.want)?;
+        Ok(prior)
+    }
+}
+
+impl core::fmt::Display for MotionPrior {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        write!(f, "{},{}", self.window, self.size_rate)
     }
 }
 
@@ -104,8 +127,7 @@ mod tests {
         target.step(crate::localise::Flag::NotFound, 0.0, &crate::spec::TrackerParams::default());
         let later = PRIOR.weight(&target, 10, Yx::new(0.5, -1.5));
         assert!(later(9, 9) > weight(9, 9) + 0.1);
-        let off = MotionPrior { window: 0.0, size_rate: 1.0 };
-        assert_eq!(off.weight(&target, 10, Yx::default())(0, 0), 1.0);
+        assert_eq!(MotionPrior::OFF.weight(&target, 10, Yx::default())(0, 0), 1.0);
     }
 
     #[test]
@@ -126,5 +148,15 @@ mod tests {
             assert_eq!(MotionPrior { window, size_rate }.validate().unwrap_err().field, field);
         }
         PRIOR.validate().unwrap();
+    }
+
+    #[test]
+    fn it_is_written_and_read_as_two_numbers() {
+        use std::string::ToString as _;
+        assert_eq!(PRIOR.to_string(), "0.4,0.25");
+        assert_eq!(" 0.4, 0.25 ".parse(), Ok(PRIOR));
+        for text in ["", "0.4", "0.4;1", "a,b", "1,1", "0.3,0", "0.3,1,2"] {
+            assert!(text.parse::<MotionPrior>().is_err(), "{text}");
+        }
     }
 }

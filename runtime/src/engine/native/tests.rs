@@ -194,6 +194,7 @@ fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
         licence: "MIT",
         card: "",
         sections: Default::default(),
+        motion: None,
         precision: None,
     };
     let mut at = 4096;

@@ -201,6 +201,7 @@ pub(in crate::engine) fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
         licence: "MIT",
         card: "",
         sections: Default::default(),
+        motion: None,
         precision: None,
     };
     let mut at = 4096;
