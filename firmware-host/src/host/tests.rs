@@ -130,11 +130,11 @@ fn commands_are_read_and_refused() {
 fn a_full_queue_loses_and_counts_and_never_waits() {
     let (mut feeder, receiver) = queue(2);
     (0..5).for_each(|i| feeder.offer(i));
-    assert_eq!(feeder.dropped(), 3);
+    assert_eq!(feeder.losses().count(), 3);
     assert_eq!(receiver.try_iter().collect::<Vec<i32>>(), [0, 1]);
     drop(receiver);
     feeder.offer(9);
-    assert_eq!(feeder.dropped(), 4, "nobody reads any more");
+    assert_eq!(feeder.losses().count(), 4, "nobody reads any more");
 }
 
 fn pictures(n: u8) -> Vec<Held> {
