@@ -5,7 +5,8 @@
 //! 3. [`run`]: the loop. One thread polls the sensors, tracks, and hands a [`FrameRecord`] to every
 //!    [`Output`]; in steady state it allocates nothing.
 //! 4. [`output`]: what outputs are, [`outputs`]: those of a configuration. [`json`]: one JSON object
-//!    per line; [`preview`]: a page for a browser; [`metrics`]: figures for Prometheus; [`notify`]:
+//!    per line; [`preview`]: a page for a browser; [`metrics`]: figures for Prometheus; [`mavlink`]: a ground
+//!    station; [`mcap`]: recordings; [`notify`]:
 //!    signs of life for systemd. [`shot`]: pictures for them; [`http`]: their server.
 //! 5. [`control`]: commands while running; [`zones`]: how warm the machine is.
 //!
@@ -16,6 +17,8 @@ pub mod config;
 pub mod control;
 pub mod http;
 pub mod json;
+pub mod mavlink;
+pub mod mcap;
 pub mod metrics;
 pub mod motion;
 pub mod notify;

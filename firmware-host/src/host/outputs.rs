@@ -4,6 +4,8 @@ use super::config::HostConfig;
 use super::control::Commands;
 use super::http::Access;
 use super::json::JsonLines;
+use super::mavlink::Mavlink;
+use super::mcap::Recorder;
 use super::metrics::{Metrics, MetricsOutput};
 use super::notify::Notify;
 use super::output::{Output, SourceInfo};
@@ -42,6 +44,13 @@ pub fn open(
         let shared = metrics.clone();
         let (sources, commands) = (sources.to_vec(), commands.clone());
         outputs.push(Box::new(Preview::open(preview, access, sources, commands, shared)?));
+    }
+    if let Some(mavlink) = &given.mavlink {
+        let output = Mavlink::open(mavlink, sources.to_vec(), commands.clone())?;
+        outputs.push(Box::new(output));
+    }
+    if let Some(mcap) = &given.mcap {
+        outputs.push(Box::new(Recorder::open(mcap, config.path(&mcap.dir), sources.to_vec())?));
     }
     if let (Some(plan), Some(metrics)) = (&given.metrics, metrics) {
         let access = match &plan.bind {

@@ -120,9 +120,14 @@ impl Encoder {
         }
     }
 
+    /// How many pixels of a picture of this size one of its JPEG stands for along a side.
+    pub fn step(&self, width: usize, height: usize) -> usize {
+        width.max(height).div_ceil(self.longest).max(1)
+    }
+
     /// A picture as JPEG, and how many pixels of it one of the JPEG stands for along a side.
     pub fn jpeg(&mut self, view: &FrameView<'_>, out: &mut Vec<u8>) -> Result<usize, String> {
-        let step = view.width().max(view.height()).div_ceil(self.longest).max(1);
+        let step = self.step(view.width(), view.height());
         thin(view, step, &mut self.picture);
         let p = &self.picture;
         let side = |n: usize| u32::try_from(n).map_err(|_| format!("{n} pixels are too many"));
