@@ -30,12 +30,12 @@ clock = "frames"
 [[source]]
 name = "rgb"
 sensor = "rgb"
-render = { repeat = true }
+render = { frames = 48, repeat = true }
 [[source]]
 name = "thermal"
 sensor = "thermal"
 profile = "lepton"
-render = { size = [160, 120], raw16 = true, repeat = true }
+render = { size = [160, 120], frames = 48, raw16 = true, repeat = true }
 [switch]
 every_s = 7.0
 [[output.json]]
@@ -65,13 +65,13 @@ get() { # port path; the answer on standard output
     exec 3>&-
 }
 
-for _ in $(seq 600); do
-    metrics=$(port_of metrics)
-    preview=$(port_of preview)
-    [[ -n $metrics && -n $preview ]] && grep -q 'started' "$dir/log" && break
+# Drawing the scene takes its time.
+until grep -q 'frame 0: started' "$dir/log"; do
     kill -0 "$pid" 2>/dev/null || { cat "$dir/log"; exit 1; }
-    sleep 0.1
+    sleep 0.2
 done
+metrics=$(port_of metrics)
+preview=$(port_of preview)
 
 start=$SECONDS
 : >"$dir/samples"

@@ -3,7 +3,7 @@
 use super::config::JsonConfig;
 use super::control::SocketFile;
 use super::output::{
-    Event, EventKind, Feeder, FrameRecord, Losses, Output, SourceInfo, Views, linger, queue,
+    Event, EventKind, Feeder, FrameRecord, LINGER, Losses, Output, SourceInfo, Views, linger, queue,
 };
 use crate::error::HostError;
 use crate::thermal::Temperature;
@@ -131,7 +131,7 @@ impl Output for JsonLines {
 
     fn finish(&mut self) {
         self.feeder.close();
-        linger(self.writer.take());
+        linger(self.writer.take(), LINGER);
     }
 }
 

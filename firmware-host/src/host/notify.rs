@@ -90,3 +90,63 @@ impl Output for Notify {
 
     fn finish(&mut self) {}
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::output::FrameRecord;
+    use super::*;
+
+    fn record(condition: Condition) -> FrameRecord {
+        FrameRecord {
+            frame: 0,
+            at: Duration::ZERO,
+            capture: None,
+            source: 0,
+            size: (8, 8),
+            sequence: 0,
+            condition,
+            target: None,
+            latency: Duration::ZERO,
+            tracking: Duration::ZERO,
+            skipped: 0,
+        }
+    }
+
+    #[test]
+    fn the_watchdog_is_fed_only_by_processed_pictures() {
+        let dir = tempfile::tempdir().expect("temp");
+        let path = dir.path().join("notify");
+        let manager = UnixDatagram::bind(&path).expect("socket");
+        manager.set_nonblocking(true).expect("socket");
+        let heard = || {
+            let mut bytes = [0; 100];
+            let n = manager.recv(&mut bytes).ok()?;
+            Some(String::from_utf8_lossy(&bytes[..n]).into_owned())
+        };
+        let path = path.to_str().expect("text");
+        let mut notify = Notify::connect(path, Some(Duration::from_millis(90))).expect("connects");
+        let event = |kind| Event { at: Duration::ZERO, frame: 0, kind };
+        assert_eq!(heard(), None);
+        notify.event(&event(EventKind::Started));
+        assert_eq!(heard().as_deref(), Some("READY=1\nSTATUS=running"));
+        for condition in [Condition::Late, Condition::Dark, Condition::Shutter] {
+            notify.frame(&record(condition), &Views(&[]));
+            assert_eq!(heard(), None, "{condition}");
+        }
+        notify.frame(&record(Condition::Good), &Views(&[]));
+        assert_eq!(heard().as_deref(), Some("WATCHDOG=1"));
+        std::thread::sleep(Duration::from_millis(31));
+        notify.frame(&record(Condition::Good), &Views(&[]));
+        assert_eq!(heard().as_deref(), Some("WATCHDOG=1"));
+        notify.event(&event(EventKind::Ended { why: "signal" }));
+        assert_eq!(heard().as_deref(), Some("STOPPING=1"));
+
+        let mut quiet = Notify::connect(path, None).expect("connects");
+        quiet.frame(&record(Condition::Good), &Views(&[]));
+        assert_eq!(heard(), None, "no watchdog is set");
+        drop(manager);
+        notify.event(&event(EventKind::Started));
+        assert_eq!(notify.losses().count(), 1);
+        assert!(Notify::connect("/no/such/socket", None).is_err());
+    }
+}

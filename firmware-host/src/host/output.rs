@@ -183,7 +183,7 @@ pub trait Output {
 }
 
 /// How long the last items of an output may take.
-const LINGER: Duration = Duration::from_secs(2);
+pub(super) const LINGER: Duration = Duration::from_secs(2);
 
 /// A count of what an output lost; its clones count the same.
 #[derive(Clone, Debug, Default)]
@@ -236,8 +236,8 @@ pub fn queue<T>(depth: usize) -> (Feeder<T>, Receiver<T>) {
 
 /// Waits for an output's thread, but not for ever: a reader that does not read must not keep the
 /// program from ending.
-pub(super) fn linger(writer: Option<JoinHandle<()>>) {
-    let (Some(writer), end) = (writer, Instant::now() + LINGER) else { return };
+pub(super) fn linger(writer: Option<JoinHandle<()>>, time: Duration) {
+    let (Some(writer), end) = (writer, Instant::now() + time) else { return };
     while !writer.is_finished() && Instant::now() < end {
         thread::sleep(Duration::from_millis(2));
     }

@@ -59,6 +59,12 @@ pub fn open(
                 let token = plan.token.as_deref();
                 Some(Access::new("output.metrics", bind, token, file.as_deref())?)
             }
+            None if plan.token.is_some() || plan.token_file.is_some() => {
+                return Err(HostError::Argument {
+                    what: "output.metrics.token".into(),
+                    reason: "belongs to a bind of its own; the preview has its token".into(),
+                });
+            }
             None if given.preview.is_some() => None,
             None => {
                 return Err(HostError::Argument {

@@ -9,7 +9,7 @@ use self::wire::{CommandMessage, Frame, ImageStatus, Parser, Sender};
 use super::config::MavlinkConfig;
 use super::control::{Command, Commands};
 use super::output::{
-    Event, EventKind, Feeder, FrameRecord, Losses, Output, SourceInfo, Views, linger, queue,
+    Event, EventKind, Feeder, FrameRecord, LINGER, Losses, Output, SourceInfo, Views, linger, queue,
 };
 use crate::error::HostError;
 use std::net::SocketAddr;
@@ -146,7 +146,7 @@ impl Output for Mavlink {
 
     fn finish(&mut self) {
         self.feeder.close();
-        linger(self.worker.take());
+        linger(self.worker.take(), LINGER);
     }
 }
 
@@ -280,7 +280,7 @@ impl Camera {
                     us if us > 0.0 => {
                         Duration::try_from_secs_f32(us / 1e6).ok().map(|every| every.max(SHORTEST))
                     }
-                    us if us == -1.0 => None,
+                    -1.0 => None,
                     _ => return Answer::Denied,
                 };
                 Answer::Accepted
@@ -340,8 +340,12 @@ fn is_share(v: f32) -> bool {
 
 /// A square box.
 fn square_around(x: f32, y: f32, radius: f32) -> Option<[f32; 4]> {
-    (radius.is_finite() && radius >= 0.5)
-        .then(|| [x - radius, y - radius, 2.0 * radius, 2.0 * radius])
+    (radius.is_finite() && radius >= 0.5).then_some([
+        x - radius,
+        y - radius,
+        2.0 * radius,
+        2.0 * radius,
+    ])
 }
 
 /// What a record means for a ground station.

@@ -22,6 +22,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 const CHUNK: usize = 4 << 20;
 /// After a failure a new file is tried so much later.
 const RETRY: Duration = Duration::from_secs(10);
+/// The last chunk has to reach the disk, which may be slow.
+const SYNCED: Duration = Duration::from_secs(5);
 const MEGABYTE: u64 = 1 << 20;
 
 enum Item {
@@ -138,7 +140,7 @@ impl Output for Recorder {
 
     fn finish(&mut self) {
         self.feeder.close();
-        linger(self.worker.take());
+        linger(self.worker.take(), SYNCED);
     }
 }
 

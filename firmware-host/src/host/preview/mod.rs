@@ -6,7 +6,9 @@ use super::control::{Command, Commands};
 use super::http::{Access, Handler, Method, Request, Responder, Server};
 use super::json::{event_line, frame_line};
 use super::metrics::Metrics;
-use super::output::{Event, Feeder, FrameRecord, Losses, Output, SourceInfo, Views, linger, queue};
+use super::output::{
+    Event, Feeder, FrameRecord, LINGER, Losses, Output, SourceInfo, Views, linger, queue,
+};
 use super::shot::{Camera, Encoder, Pool, Shot, camera};
 use crate::error::HostError;
 use std::collections::VecDeque;
@@ -176,7 +178,7 @@ impl Output for Preview {
 
     fn finish(&mut self) {
         self.feeder.close();
-        linger(self.worker.take());
+        linger(self.worker.take(), LINGER);
         self.shared.state().ended = true;
         self.shared.changed.notify_all();
         self.server = None;
