@@ -111,7 +111,9 @@ awk -v limit="$drift" -v code="$code" -v threads="$threads" -v files="$files" '
             early * 1e3, late * 1e3, (late / early - 1) * 100, p99 * 1e3
         printf "memory: %.1f MB early, %.1f MB late; %d items dropped by outputs\n", before / 1e6, after / 1e6, dropped
         if (code != 0) { print "FAILED: exit code " code; bad = 1 }
-        if (after > before * 1.02 + 1e6) { print "FAILED: memory grows"; bad = 1 }
+        # Chunks of the recording fill faster when frames do: a few megabytes either way. A leak of 10
+        # bytes per frame shows within two hours; short runs say less.
+        if (after > before * 1.02 + 4e6) { print "FAILED: memory grows"; bad = 1 }
         if (late > early * (1 + limit)) { print "FAILED: frames get slower"; bad = 1 }
         if (frames[NR] <= frames[NR - 1]) { print "FAILED: it stands still"; bad = 1 }
         exit bad
