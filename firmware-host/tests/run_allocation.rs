@@ -1,12 +1,15 @@
-//! The loop of `tsda run` allocates nothing once it runs: two sensors, the native engine, JSON lines,
-//! a thermal camera's gain, predictions during a fault, changes of sensors.
+//! The loop of `tsda run` allocates nothing once it runs: two sensors, the native engine, all outputs
+//! with somebody looking at the preview, a thermal camera's gain, predictions during a fault, changes
+//! of sensors.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
-use tsda_host::host::config::JsonConfig;
-use tsda_host::host::json::JsonLines;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
 use tsda_host::host::plan::Plan;
-use tsda_host::host::{Host, HostConfig, Output, control};
+use tsda_host::host::{Host, HostConfig, control, outputs};
 use tsda_host::model;
 
 struct Counting;
@@ -58,19 +61,64 @@ render = { size = [160, 120], raw16 = true, repeat = true }
 [switch]
 every_s = 0.5
 [switch.failure]
+# Nobody listens there: sending costs the same.
+[[output.json]]
+to = "udp:127.0.0.1:9"
+queue = 4096
+[output.preview]
+bind = "127.0.0.1:0"
+rate = 120
+[output.metrics]
+[output.mavlink]
+to = "udp:127.0.0.1:9"
+[output.mcap]
+dir = "recording"
+rate = 1000
+[process.temperature]
 "#;
+
+/// Looks at the preview until told to stop; answers the pictures seen.
+fn look(address: &str, stop: &AtomicBool) -> usize {
+    let mut seen = 0;
+    while !stop.load(Ordering::Relaxed) {
+        let mut stream = TcpStream::connect(address).expect("connects");
+        let ask = "GET /picture HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
+        stream.write_all(ask.as_bytes()).expect("asks");
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).expect("answers");
+        seen += usize::from(answer.starts_with(b"HTTP/1.1 200"));
+    }
+    seen
+}
 
 #[test]
 fn the_loop_allocates_nothing() {
-    let config = HostConfig::parse(CONFIG, "test").expect("config");
+    let dir = tempfile::tempdir().expect("temp");
+    let mut config = HostConfig::parse(CONFIG, "test").expect("config");
+    config.base = dir.path().to_path_buf();
     let plan = Plan::new(&config).expect("plan");
     let tracker = model::tracker(&model::load(None).expect("model")).expect("tracker");
-    let sources = plan.sensors.iter().map(|s| s.info().clone()).collect();
-    // Nobody listens there: sending costs the same.
-    let to = JsonConfig { to: "udp:127.0.0.1:9".into(), queue: 4096 };
-    let outputs: Vec<Box<dyn Output>> = vec![Box::new(JsonLines::open(&to, sources).expect("udp"))];
-    let (_commands, inbox) = control::channel();
-    let mut host = Host::new(plan, tracker, outputs, inbox);
+    let sources: Vec<_> = plan.sensors.iter().map(|s| s.info().clone()).collect();
+    let (commands, inbox) = control::channel();
+    let zones = outputs::zones(&config).expect("zones");
+    let outputs = outputs::open(&config, &sources, &commands, zones.as_ref()).expect("outputs");
+    let address = outputs.iter().find_map(|o| o.name().strip_prefix("preview at http://"));
+    let address = address.expect("preview").to_owned();
+    let (stop, seen) = (AtomicBool::new(false), AtomicUsize::new(0));
+    let mut host = Host::new(plan, tracker, outputs, inbox).with_zones(zones);
+    thread::scope(|scope| {
+        scope.spawn(|| seen.store(look(&address, &stop), Ordering::Relaxed));
+        run(&mut host);
+        stop.store(true, Ordering::Relaxed);
+    });
+    let seen = seen.load(Ordering::Relaxed);
+    println!("{seen} pictures seen");
+    assert!(seen > 0, "nobody looked");
+    let recorded = std::fs::read_dir(dir.path().join("recording")).expect("folder").count();
+    assert_eq!(recorded, 1);
+}
+
+fn run<E: tsda_runtime::Engine>(host: &mut Host<E>) {
     let (mut steps, mut allocations) = (0u32, 0usize);
     host.start();
     for frame in 0..150 {

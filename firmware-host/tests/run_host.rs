@@ -295,3 +295,27 @@ fn a_check_opens_everything_and_runs_nothing() {
         assert!(error.contains(word) && error.lines().count() == 1, "{word}: {error}");
     }
 }
+
+#[test]
+fn frames_are_left_out_while_it_is_too_warm() {
+    let dir = tempfile::tempdir().expect("temp");
+    let zone = dir.path().join("thermal_zone0");
+    fs::create_dir(&zone).expect("folder");
+    fs::write(zone.join("temp"), "91000").expect("temp");
+    let config = format!(
+        "clock = \"frames\"\n{}\n[process]\nmlockall = true\nsched_fifo = 1\n\
+         [process.temperature]\npath = \".\"\nlimit = 90\nrate = 5",
+        SENSORS.replace("RGB_FAULTS", "").replace("[320, 240] }", "[320, 240], frames = 20 }")
+    );
+    let output = tsda(dir.path(), &config, &[]);
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{log}");
+    let (frames, events): (Vec<_>, Vec<_>) =
+        lines(&output).into_iter().partition(|v| v["type"] == "frame");
+    let at: Vec<u64> = frames.iter().map(|f| f["sequence"].as_u64().expect("sequence")).collect();
+    // Every fifth of 25 per second.
+    assert_eq!(at, [0, 5, 10, 15], "{log}");
+    assert!(events.iter().any(|e| e["event"] == "throttled"), "{log}");
+    // With or without the right to it, the run goes on.
+    println!("{log}");
+}

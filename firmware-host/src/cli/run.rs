@@ -2,10 +2,10 @@
 
 use super::stop_flag;
 use crate::error::{EXIT_NO_PICTURES, EXIT_OK, HostError};
-use crate::host::control::{self, Commands};
-use crate::host::json::JsonLines;
+use crate::host::control;
+use crate::host::outputs;
 use crate::host::plan::Plan;
-use crate::host::{Ending, Host, HostConfig, Output, SourceInfo};
+use crate::host::{Ending, Host, HostConfig, SourceInfo};
 use crate::model;
 use crate::redetect::RedetectArgs;
 use clap::Args;
@@ -39,7 +39,8 @@ pub(super) fn run(args: &RunArgs) -> Result<u8, HostError> {
         .apply(&mut tracker)?;
     let sources: Vec<SourceInfo> = plan.sensors.iter().map(|s| s.info().clone()).collect();
     let (commands, inbox) = control::channel();
-    let outputs = outputs(&config, &sources, &commands)?;
+    let zones = outputs::zones(&config)?;
+    let outputs = outputs::open(&config, &sources, &commands, zones.as_ref())?;
 
     if args.check {
         println!("model:   {} on {}", bundle.path().display(), plan.engine);
@@ -49,6 +50,9 @@ pub(super) fn run(args: &RunArgs) -> Result<u8, HostError> {
         }
         for output in &outputs {
             println!("output:  {}", output.name());
+        }
+        for (zone, celsius) in zones.iter().flat_map(|z| z.readings()) {
+            println!("zone:    {zone}, {celsius:.1} degrees Celsius");
         }
         match &plan.target {
             Some((i, b)) => println!(
@@ -61,6 +65,10 @@ pub(super) fn run(args: &RunArgs) -> Result<u8, HostError> {
         return Ok(EXIT_OK);
     }
 
+    // The port of an address that left it open, among others.
+    for output in outputs.iter().skip(1) {
+        let _ = writeln!(std::io::stderr(), "tsda: output: {}", output.name());
+    }
     if config.control.stdin {
         control::listen_stdin(commands.clone())?;
     }
@@ -68,21 +76,10 @@ pub(super) fn run(args: &RunArgs) -> Result<u8, HostError> {
         Some(path) => Some(control::listen_socket(&config.path(path), commands.clone())?),
         None => None,
     };
-    let mut host = Host::new(plan, tracker, outputs, inbox);
+    // After all other threads were started: they keep their priority.
+    outputs::prepare(&config)?;
+    let mut host = Host::new(plan, tracker, outputs, inbox).with_zones(zones);
     let summary = host.run(stop_flag())?;
     let _ = write!(std::io::stderr(), "tsda: {summary}");
     Ok(if summary.ending == Ending::NoPictures { EXIT_NO_PICTURES } else { EXIT_OK })
-}
-
-/// Opens all outputs. `_commands` is for those that also take commands.
-fn outputs(
-    config: &HostConfig,
-    sources: &[SourceInfo],
-    _commands: &Commands,
-) -> Result<Vec<Box<dyn Output>>, HostError> {
-    let mut outputs: Vec<Box<dyn Output>> = vec![Box::new(JsonLines::log(sources.to_vec())?)];
-    for json in &config.output.json {
-        outputs.push(Box::new(JsonLines::open(json, sources.to_vec())?));
-    }
-    Ok(outputs)
 }

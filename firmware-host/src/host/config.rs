@@ -1,5 +1,13 @@
 //! `host.toml` as written. Unknown keys are errors; [`super::plan`] says what it all means.
 
+mod output;
+mod process;
+
+pub use output::{
+    JsonConfig, MavlinkConfig, McapConfig, MetricsConfig, OutputConfig, PreviewConfig,
+};
+pub use process::{ProcessConfig, TemperatureConfig};
+
 use super::clock::ClockKind;
 use super::source::Fault;
 use crate::error::HostError;
@@ -47,6 +55,9 @@ pub struct HostConfig {
     /// What comes out.
     #[serde(default)]
     pub output: OutputConfig,
+    /// The process itself.
+    #[serde(default)]
+    pub process: ProcessConfig,
     /// Folder that relative paths start from; that of the file.
     #[serde(skip)]
     pub base: PathBuf,
@@ -304,30 +315,6 @@ pub struct ControlConfig {
     pub stdin: bool,
     /// One JSON command per line over a Unix socket.
     pub socket: Option<PathBuf>,
-}
-
-/// Outputs.
-#[derive(Clone, Debug, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct OutputConfig {
-    /// JSON lines.
-    #[serde(default)]
-    pub json: Vec<JsonConfig>,
-}
-
-/// JSON lines.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct JsonConfig {
-    /// `stdout`, `udp:HOST:PORT` or `unix:PATH`.
-    pub to: String,
-    /// Lines that may wait.
-    #[serde(default = "queue_depth")]
-    pub queue: usize,
-}
-
-fn queue_depth() -> usize {
-    256
 }
 
 impl HostConfig {

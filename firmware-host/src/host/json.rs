@@ -2,7 +2,9 @@
 
 use super::config::JsonConfig;
 use super::control::SocketFile;
-use super::output::{Event, EventKind, Feeder, FrameRecord, Output, SourceInfo, Views, queue};
+use super::output::{
+    Event, EventKind, Feeder, FrameRecord, LINGER, Losses, Output, SourceInfo, Views, linger, queue,
+};
 use crate::error::HostError;
 use crate::thermal::Temperature;
 use serde::Serialize;
@@ -12,11 +14,8 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
 use std::sync::mpsc::Receiver;
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use tsda_runtime::{Modality, TrackState};
-
-/// How long the last lines may take.
-const LINGER: Duration = Duration::from_secs(2);
 
 enum Line {
     Frame(FrameRecord),
@@ -126,20 +125,13 @@ impl Output for JsonLines {
         self.feeder.offer(Line::Event(event.clone()));
     }
 
-    fn dropped(&self) -> u64 {
-        self.feeder.dropped()
+    fn losses(&self) -> &Losses {
+        self.feeder.losses()
     }
 
     fn finish(&mut self) {
         self.feeder.close();
-        let (Some(writer), end) = (self.writer.take(), Instant::now() + LINGER) else { return };
-        // A reader that does not read must not keep the program from ending.
-        while !writer.is_finished() && Instant::now() < end {
-            thread::sleep(Duration::from_millis(2));
-        }
-        if writer.is_finished() {
-            let _ = writer.join();
-        }
+        linger(self.writer.take(), LINGER);
     }
 }
 
@@ -157,6 +149,21 @@ fn write_lines(lines: &Receiver<Line>, mut way: Way, sources: &[SourceInfo]) {
             return;
         }
     }
+}
+
+/// A record as a line of JSON.
+pub(super) fn frame_line(record: &FrameRecord, sources: &[SourceInfo]) -> Vec<u8> {
+    let mut text = Vec::with_capacity(512);
+    // Plain numbers and names: cannot fail, and an empty line is skipped by every reader.
+    let _ = encode(&JsonFrame::new(record, sources), &mut text);
+    text
+}
+
+/// An event as a line of JSON.
+pub(super) fn event_line(event: &Event, sources: &[SourceInfo]) -> Vec<u8> {
+    let mut text = Vec::with_capacity(256);
+    let _ = encode(&JsonEvent::new(event, sources), &mut text);
+    text
 }
 
 fn encode(value: &impl Serialize, text: &mut Vec<u8>) -> io::Result<()> {
@@ -307,6 +314,11 @@ impl<'a> JsonEvent<'a> {
             EventKind::Back { source } => {
                 Self { event: "camera_back", source: name(*source), ..base }
             }
+            EventKind::Throttled { on, celsius } => Self {
+                event: if *on { "throttled" } else { "unthrottled" },
+                reason: Some(format!("{celsius:.1} degrees Celsius")),
+                ..base
+            },
             EventKind::Refused { what } => {
                 Self { event: "refused", reason: Some(what.clone()), ..base }
             }

@@ -1,10 +1,14 @@
 //! What comes out of a run: a record per frame, events, and what takes them.
 
 use super::sensor::Sensor;
+use super::source::Counters;
 use crate::switch::{Condition, Reason};
 use crate::thermal::Temperature;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::time::Duration;
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
 use tsda_runtime::{BBox, FrameView, Modality, TrackState};
 
 /// What outputs know about a source from the start; its place in the list is its number.
@@ -109,6 +113,13 @@ pub enum EventKind {
         /// Which.
         source: usize,
     },
+    /// The machine is too warm, frames are left out; or no longer.
+    Throttled {
+        /// Whether it begins.
+        on: bool,
+        /// The warmest zone, in degrees Celsius.
+        celsius: f32,
+    },
     /// Something that was asked for cannot be done.
     Refused {
         /// What and why.
@@ -136,6 +147,11 @@ impl<'a> Views<'a> {
     pub fn condition(&self, source: usize, now: Duration) -> Option<Condition> {
         Some(self.0.get(source)?.watch().condition(now))
     }
+
+    /// Counts of a source since the start.
+    pub fn counters(&self, source: usize) -> Option<Counters> {
+        Some(self.0.get(source)?.source().counters())
+    }
 }
 
 /// Takes what comes out of a run.
@@ -154,18 +170,42 @@ pub trait Output {
     /// Takes an event.
     fn event(&mut self, event: &Event);
 
+    /// Where lost frames and events are counted.
+    fn losses(&self) -> &Losses;
+
     /// Frames and events that were lost so far.
-    fn dropped(&self) -> u64;
+    fn dropped(&self) -> u64 {
+        self.losses().count()
+    }
 
     /// Writes what is left, for at most a second or two.
     fn finish(&mut self);
+}
+
+/// How long the last items of an output may take.
+pub(super) const LINGER: Duration = Duration::from_secs(2);
+
+/// A count of what an output lost; its clones count the same.
+#[derive(Clone, Debug, Default)]
+pub struct Losses(Arc<AtomicU64>);
+
+impl Losses {
+    /// Counts one more.
+    pub fn add(&self) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// So many so far.
+    pub fn count(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
 }
 
 /// The sending end of a bounded queue that never waits.
 #[derive(Debug)]
 pub struct Feeder<T> {
     sender: Option<SyncSender<T>>,
-    dropped: u64,
+    losses: Losses,
 }
 
 impl<T> Feeder<T> {
@@ -173,13 +213,13 @@ impl<T> Feeder<T> {
     pub fn offer(&mut self, item: T) {
         let sent = self.sender.as_ref().map(|s| s.try_send(item));
         if !matches!(sent, Some(Ok(()))) {
-            self.dropped += 1;
+            self.losses.add();
         }
     }
 
     /// Items lost so far.
-    pub const fn dropped(&self) -> u64 {
-        self.dropped
+    pub const fn losses(&self) -> &Losses {
+        &self.losses
     }
 
     /// Closes the queue; its reader ends after what is in it.
@@ -191,5 +231,17 @@ impl<T> Feeder<T> {
 /// A bounded queue between the loop and an output's thread.
 pub fn queue<T>(depth: usize) -> (Feeder<T>, Receiver<T>) {
     let (sender, receiver) = sync_channel(depth.max(1));
-    (Feeder { sender: Some(sender), dropped: 0 }, receiver)
+    (Feeder { sender: Some(sender), losses: Losses::default() }, receiver)
+}
+
+/// Waits for an output's thread, but not for ever: a reader that does not read must not keep the
+/// program from ending.
+pub(super) fn linger(writer: Option<JoinHandle<()>>, time: Duration) {
+    let (Some(writer), end) = (writer, Instant::now() + time) else { return };
+    while !writer.is_finished() && Instant::now() < end {
+        thread::sleep(Duration::from_millis(2));
+    }
+    if writer.is_finished() {
+        let _ = writer.join();
+    }
 }

@@ -7,10 +7,12 @@ use super::output::{Event, EventKind, FrameRecord, Output, SourceInfo, TargetRec
 use super::plan::{Plan, Registrations};
 use super::sensor::{News, Sensor};
 use super::source::Counters;
+use super::zones::Zones;
 use crate::error::HostError;
 use crate::switch::policy::Policy;
 use crate::switch::{Condition, Homography, Reason};
 use std::fmt;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
@@ -124,6 +126,10 @@ pub struct Host<E> {
     reported: Vec<Condition>,
     skipped: u64,
     engine_failures: u32,
+    zones: Option<Arc<Zones>>,
+    /// Whether frames are left out, and when the last one was used.
+    throttled: bool,
+    used: Option<Duration>,
     record: u64,
     predicted: u64,
     switches: u64,
@@ -159,12 +165,21 @@ impl<E: Engine> Host<E> {
             reported: vec![Condition::Waiting; n],
             skipped: 0,
             engine_failures: 0,
+            zones: None,
+            throttled: false,
+            used: None,
             record: 0,
             predicted: 0,
             switches: 0,
             tracked: 0,
             latency: (Duration::ZERO, Duration::ZERO),
         }
+    }
+
+    /// Leaves frames out while the machine is too warm.
+    #[must_use]
+    pub fn with_zones(self, zones: Option<Arc<Zones>>) -> Self {
+        Self { zones, ..self }
     }
 
     /// What outputs need to know about the sensors of a plan.
@@ -239,8 +254,24 @@ impl<E: Engine> Host<E> {
             return Ok(Some(Ending::NoPictures));
         }
         self.decide(now);
-        self.follow(now, arrived, fresh & 1 << self.active != 0)?;
+        let used = fresh & 1 << self.active != 0 && !self.left_out(now);
+        self.follow(now, arrived, used)?;
         Ok(self.frames.is_some_and(|n| self.record >= n).then_some(Ending::Frames))
+    }
+
+    /// Whether a frame at `now` is left out because the machine is too warm.
+    fn left_out(&mut self, now: Duration) -> bool {
+        let Some(zones) = &self.zones else { return false };
+        let (pause, celsius) = (zones.pause(), zones.warmest().unwrap_or(f32::NAN));
+        if pause.is_some() != self.throttled {
+            self.throttled = pause.is_some();
+            self.event(EventKind::Throttled { on: self.throttled, celsius });
+        }
+        let early = matches!((pause, self.used), (Some(p), Some(u)) if now.saturating_sub(u) < p);
+        if !early {
+            self.used = Some(now);
+        }
+        early
     }
 
     fn decide(&mut self, now: Duration) {

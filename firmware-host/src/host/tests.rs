@@ -41,6 +41,10 @@ fn the_example_in_the_documentation_is_understood() {
     let config = HostConfig::parse(text, "host.toml").expect("parses");
     assert!(config.sources.iter().any(|s| s.v4l2.is_some()));
     assert!(config.switch.failure.is_some() && !config.registrations.is_empty());
+    let output = &config.output;
+    assert!(output.preview.is_some() && output.metrics.is_some());
+    assert!(output.mavlink.is_some() && output.mcap.is_some());
+    assert!(config.process.temperature.is_some());
 }
 
 #[test]
@@ -130,11 +134,11 @@ fn commands_are_read_and_refused() {
 fn a_full_queue_loses_and_counts_and_never_waits() {
     let (mut feeder, receiver) = queue(2);
     (0..5).for_each(|i| feeder.offer(i));
-    assert_eq!(feeder.dropped(), 3);
+    assert_eq!(feeder.losses().count(), 3);
     assert_eq!(receiver.try_iter().collect::<Vec<i32>>(), [0, 1]);
     drop(receiver);
     feeder.offer(9);
-    assert_eq!(feeder.dropped(), 4, "nobody reads any more");
+    assert_eq!(feeder.losses().count(), 4, "nobody reads any more");
 }
 
 fn pictures(n: u8) -> Vec<Held> {
@@ -224,4 +228,29 @@ fn motion_goes_on_and_is_mapped() {
     assert!((b.x - 158.0).abs() < 0.2 && (b.w, b.h) == (8.0, 3.0), "{b:?}");
     let b = kept_inside(BBox::new(-50.0, 300.0, 10.0, 20.0), 64, 48);
     assert_eq!(b.centre(), (0.0, 48.0));
+}
+
+#[test]
+fn outputs_that_make_no_sense_are_refused_by_their_key() {
+    let (commands, _inbox) = control::channel();
+    for (text, words) in [
+        ("[output.preview]\nbind = \"0.0.0.0:0\"", &["output.preview.token", "other machines"][..]),
+        ("[output.preview]\nbind = \"127.0.0.1:0\"\nquality = 0", &["output.preview.quality"]),
+        ("[output.preview]\nbind = \"127.0.0.1:0\"\nrate = 0", &["output.preview.rate"]),
+        ("[output.metrics]", &["output.metrics.bind"]),
+        ("[output.metrics]\nbind = \"0.0.0.0:0\"", &["output.metrics.token"]),
+        ("[output.mavlink]\nto = \"tcp:1\"", &["output.mavlink.to"]),
+        ("[output.mcap]", &["output.mcap.dir"]),
+        ("[output.mcap]\ndir = \"x\"\ntotal_mb = 300", &["output.mcap.total_mb"]),
+    ] {
+        let config = HostConfig::parse(&format!("{GOOD}{text}"), "host.toml").expect("parses");
+        let error = outputs::open(&config, &[], &commands, None).map(drop).expect_err(text);
+        assert_eq!(error.exit_code(), 2);
+        for word in words {
+            assert!(error.to_string().contains(word), "`{word}` in `{error}`");
+        }
+    }
+    let config = format!("{GOOD}[process]\nsched_fifo = 100");
+    let config = HostConfig::parse(&config, "host.toml").expect("parses");
+    assert!(outputs::prepare(&config).expect_err("range").to_string().contains("sched_fifo"));
 }

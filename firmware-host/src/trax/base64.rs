@@ -22,12 +22,13 @@ pub enum Base64Error {
 
 const NONE: u8 = 0xFF;
 
+const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+
 const VALUES: [u8; 256] = {
-    let alphabet = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut values = [NONE; 256];
     let mut i = 0;
-    while i < alphabet.len() {
-        values[alphabet[i] as usize] = i as u8;
+    while i < ALPHABET.len() {
+        values[ALPHABET[i] as usize] = i as u8;
         i += 1;
     }
     values
@@ -67,4 +68,19 @@ pub fn decode(text: &str) -> Result<Vec<u8>, Base64Error> {
         out.extend_from_slice(&[a, b, c][..chunk.len() - 1]);
     }
     Ok(out)
+}
+
+/// Encodes bytes, with padding.
+pub fn encode(bytes: &[u8]) -> String {
+    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for chunk in bytes.chunks(3) {
+        let mut word = [0; 4];
+        word[1..=chunk.len()].copy_from_slice(chunk);
+        let word = u32::from_be_bytes(word);
+        for i in 0..4 {
+            let symbol = ALPHABET[(word >> (18 - 6 * i) & 63) as usize];
+            out.push(if i <= chunk.len() { symbol as char } else { '=' });
+        }
+    }
+    out
 }

@@ -13,10 +13,14 @@ pub struct Held {
 }
 
 impl Held {
+    /// No picture yet.
+    pub const fn empty() -> Self {
+        Self { data: Vec::new(), width: 0, height: 0, stride: 0, format: PixelFormat::Gray8 }
+    }
+
     /// A copy of a view.
     pub fn of(view: &FrameView<'_>) -> Self {
-        let mut held =
-            Self { data: Vec::new(), width: 0, height: 0, stride: 0, format: PixelFormat::Gray8 };
+        let mut held = Self::empty();
         held.hold(view);
         held
     }

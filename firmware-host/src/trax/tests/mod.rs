@@ -11,21 +11,6 @@ use image_crate::ImageEncoder as _;
 
 use ::image as image_crate;
 
-/// RFC 4648 with padding.
-fn encode_base64(bytes: &[u8]) -> String {
-    const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut out = String::new();
-    for chunk in bytes.chunks(3) {
-        let word =
-            chunk.iter().fold(0u32, |w, b| w << 8 | u32::from(*b)) << (8 * (3 - chunk.len()));
-        for i in 0..4 {
-            let symbol = ALPHABET[(word >> (18 - 6 * i) & 63) as usize];
-            out.push(if i <= chunk.len() { symbol as char } else { '=' });
-        }
-    }
-    out
-}
-
 /// A picture with something to see in it.
 fn pattern(width: u32, height: u32) -> image_crate::RgbImage {
     image_crate::RgbImage::from_fn(width, height, |x, y| {
