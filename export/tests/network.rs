@@ -50,7 +50,6 @@ fn random_bundle(name: &str, spec: &ModelSpec) -> (Vec<u8>, usize) {
         spec: *spec,
         tracker: TrackerParams::default(),
         trained_on: TrainedOn::default(),
-        motion: None,
         calibration: None,
         provenance: Provenance::default(),
         figures: Default::default(),
@@ -58,6 +57,7 @@ fn random_bundle(name: &str, spec: &ModelSpec) -> (Vec<u8>, usize) {
         card: "# Random",
         sections: Default::default(),
         precision: None,
+        motion: None,
     };
     (bundle::encode(&manifest, &sections).unwrap(), network::parameters(&net))
 }
@@ -361,6 +361,7 @@ fn the_written_bundle_reads_back() {
             card,
             sections: Default::default(),
             precision: None,
+            motion: None,
         };
         let bytes = bundle::encode(&manifest, &sections).unwrap();
         let read = Bundle::parse(&bytes).unwrap();
@@ -388,6 +389,7 @@ fn empty() -> Manifest<'static> {
         card: "",
         sections: Default::default(),
         precision: None,
+        motion: None,
     }
 }
 

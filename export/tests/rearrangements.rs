@@ -226,6 +226,7 @@ fn either_form_of_slot_runs_in_the_engine() {
             card: "",
             sections: Default::default(),
             precision: None,
+            motion: None,
         };
         let bytes = bundle::encode(&manifest, &sections).unwrap();
         let bundle = Bundle::parse(&bytes).unwrap();

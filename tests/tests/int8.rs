@@ -45,6 +45,7 @@ fn random(spec: &ModelSpec) -> Vec<u8> {
         card: "",
         sections: Default::default(),
         precision: None,
+        motion: None,
     };
     bundle::encode(&manifest, &sections).unwrap()
 }
@@ -115,7 +116,7 @@ fn halves_change_little_and_take_half_the_room() {
         |bytes: &[u8]| Bundle::parse(bytes).unwrap().require(SectionKind::Weights).unwrap().len();
     assert!(weights(&bytes) < weights(&floats) * 55 / 100);
     let narrow = Bundle::parse(&bytes).unwrap();
-    for choice in [EngineChoice::default(), EngineChoice::Tract] {
+    for choice in [EngineChoice::default(), EngineChoice::Tract(Default::default())] {
         let off = off(&narrow, &choice);
         assert!(off <= 1e-4, "{choice}: {off}");
     }

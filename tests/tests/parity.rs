@@ -56,6 +56,7 @@ fn burn_and_the_engines_drive_the_tracker_alike() {
         card: "",
         sections: Default::default(),
         precision: None,
+        motion: None,
     };
     let bytes =
         bundle::encode(&manifest, &network::files(&network::graphs(&net).unwrap())).unwrap();

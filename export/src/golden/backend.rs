@@ -391,6 +391,7 @@ fn on_engine<E: Engine + 'static>(
         card: "",
         sections: Default::default(),
         precision: None,
+        motion: None,
     };
     let graphs = network::graphs(&net)?;
     let engine = {

@@ -35,7 +35,7 @@ pub(super) fn run(args: &RunArgs) -> Result<u8, HostError> {
     plan.frames = args.frames.or(plan.frames);
     let bundle = model::load(config.model.as_deref().map(|m| config.path(m)).as_deref())?;
     let mut tracker = model::tracker_on(&bundle, &plan.engine)?;
-    RedetectArgs { scan_when_lost: config.scan_when_lost, scan_threshold: None }
+    RedetectArgs { scan_when_lost: config.scan_when_lost, ..RedetectArgs::default() }
         .apply(&mut tracker)?;
     let sources: Vec<SourceInfo> = plan.sensors.iter().map(|s| s.info().clone()).collect();
     let (commands, inbox) = control::channel();

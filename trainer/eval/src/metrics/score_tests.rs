@@ -318,10 +318,13 @@ fn boxes(n: usize) -> impl Strategy<Value = Vec<Row>> {
 }
 
 /// Values of vot-toolkit 0.7.4; 0.9.0 gives the same.
+/// Two boxes, the picture's size when it cuts them, the toolkit's overlap.
+type Case = (Row, Row, Option<(u32, u32)>, f64);
+
 #[test]
 fn vot_overlap_left_of_and_above_the_picture() {
     let cut = Some((20, 14));
-    let cases: [(Row, Row, Option<(u32, u32)>, f64); 21] = [
+    let cases: [Case; 21] = [
         ([0.0, 308.0, 349.0, 161.0], [-3.0, 287.0, 345.0, 180.0], None, 0.857319),
         ([0.0, 0.0, 10.0, 10.0], [-1.0, 0.0, 11.0, 10.0], None, 0.900000),
         ([0.0, 0.0, 10.0, 10.0], [-4.0, 0.0, 12.0, 10.0], None, 0.600000),
