@@ -79,7 +79,8 @@ impl Sequence for Clip {
     }
     fn truth(&self, _: usize, frame: usize, modality: Modality) -> Option<BBox> {
         (frame < self.frames && (self.seen)(frame, modality))
-            .then(|| BBox::new(frame as f32, 4.0, 12.0, 12.0))
+            // Inside the picture at all times: what lies outside is not drawn.
+            .then(|| BBox::new((frame % 20) as f32, 4.0, 12.0, 12.0))
     }
     fn picture(&self, frame: usize, modality: Modality) -> Result<Picture, DatasetError> {
         if frame >= self.frames || !(self.seen)(frame, modality) {

@@ -36,13 +36,14 @@ fn ranges_follow_what_was_seen() {
     let r = positive.rounding().unwrap();
     assert!((125..=130).contains(&r.zero) && (r.scale * 255.0 - 12.0).abs() < 0.5, "{r:?}");
 
-    // One stray value among many small ones is cut off.
+    // Two stray values among many small ones are cut off as far as it pays: rounding costs
+    // 1e5 (2 r / 255)^2 / 12, clipping 2 (8 - r)^2, the sum is least at r = 6.37.
     let mut stray = Histogram::default();
     let many: Vec<f32> = (0..100_000).map(|i| (i % 1000) as f32 / 500.0 - 1.0).collect();
     stray.add(&many);
     stray.add(&[8.0, -8.0]);
     let r = stray.rounding().unwrap();
-    assert!(r.scale * 255.0 < 8.0, "{r:?}");
+    assert!((r.scale * 255.0 - 2.0 * 6.37).abs() < 0.3, "{r:?}");
 }
 
 #[test]

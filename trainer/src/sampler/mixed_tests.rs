@@ -165,7 +165,11 @@ fn every_loader_feeds_the_sampler() {
             let still = ["pairs", "coco", "stills"].iter().any(|k| kind.starts_with(k));
             let causal = frames[1] < frames[0] && frames[0] < search;
             assert!(if still { search == 0 } else { causal }, "{}", d.id);
-            assert!(still || (search - frames[0] < 8 && frames[0] - frames[1] <= 8), "{}", d.id);
+            // The last boxes of VTUAV's clips are unknown: a base near them has no search frame
+            // within the gap, which then widens (spec 2.1).
+            let widens = kind.starts_with("vtuav");
+            let within = search - frames[0] < 8 && frames[0] - frames[1] <= 8;
+            assert!(still || widens || within, "{}", d.id);
             assert!((d.search.picture.width, d.search.picture.height) == (64, 48));
             let thermal_only = kind == "stills" || kind.ends_with("/thermal");
             assert!(!thermal_only || d.search.at.modality == Modality::Thermal);
