@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Trains and evaluates every row of the alignment ablation and writes the table.
 
-    python3 trainer/scripts/ablation.py --config trainer/configs/nano-ablation.toml \
+    python3 trainer/scripts/ablation.py --config trainer/configs/ablation.toml \
         --pairs data/pairs --clips data/sequences --bin target/release --out out/ablation \
         [--rows cm,enc-cfa --seeds 1,2] [--data-root DIR] [--backbone FILE] [--jobs 2]
 
@@ -15,7 +15,6 @@ Writes OUT/results.json and OUT/table.md after every run.
 import argparse
 import json
 import pathlib
-import re
 import statistics
 import subprocess
 import sys
@@ -24,17 +23,6 @@ import time
 ROWS = ["baseline", "cm", "pre-afa", "pre-cfa", "enc-afa", "enc-cfa", "joint"]
 PROTOCOLS = ["rgb2t", "t2rgb", "switch:20"]
 KEYS = ["sr50", "pr20", "auc"]
-
-
-def configuration(base, row, seed):
-    """The base experiment with the row's preset and the seed; everything else is equal."""
-    text, n = re.subn(r"(?m)^seed\s*=.*$", f"seed = {seed}", base)
-    if n != 1:
-        sys.exit("ablation: the configuration needs exactly one line 'seed = ..' (under [run])")
-    text, n = re.subn(r'(?m)^preset\s*=\s*"ROW"\s*(#.*)?$', f'preset = "{row}"', text)
-    if n != 1:
-        sys.exit('ablation: the configuration needs exactly one line \'preset = "ROW"\' (under [align])')
-    return text
 
 
 def call(command, log):
@@ -53,17 +41,17 @@ def require(command, log, accepted=(0,)):
     return seconds
 
 
-def one(args, base, row, seed):
+def one(args, row, seed):
     out = args.out / f"{row}-s{seed}"
     done = out / "figures.json"
     if done.exists():
         return json.loads(done.read_text())
     out.mkdir(parents=True, exist_ok=True)
-    log, run, config = out / "commands.log", out / "run", out / "config.toml"
-    config.write_text(configuration(base, row, seed))
+    log, run = out / "commands.log", out / "run"
     train, export, tsda = (args.bin / n for n in ("tsda-train", "tsda-export", "tsda"))
     if not (run / "model.safetensors").exists():
-        command = [train, "fit", "--config", config, "--out", run]
+        command = [train, "fit", "--config", args.config, "--out", run]
+        command += ["--align-preset", row, "--seed", seed, "--align-start", args.align_start]
         command += ["--data-root", args.data_root] if args.data_root else []
         command += ["--backbone", args.backbone] if args.backbone else []
         command += ["--resume"] if any(run.glob("checkpoint-*")) else []
@@ -150,6 +138,7 @@ def main():
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("--rows", default=",".join(ROWS))
     parser.add_argument("--seeds", default="1")
+    parser.add_argument("--align-start", type=int, default=300, help="step from which alignment acts")
     parser.add_argument("--data-root", type=pathlib.Path)
     parser.add_argument("--backbone", type=pathlib.Path)
     parser.add_argument("--jobs", type=int, default=2)
@@ -157,7 +146,6 @@ def main():
     rows = args.rows.split(",")
     if unknown := [r for r in rows if r not in ROWS]:
         sys.exit(f"ablation: no row {unknown[0]!r}; rows are {', '.join(ROWS)}")
-    base = args.config.read_text()
     args.out.mkdir(parents=True, exist_ok=True)
     results = {}
     for path in sorted(args.out.glob("*/figures.json")):
@@ -165,7 +153,7 @@ def main():
         results[found["row"], found["seed"]] = found
     for seed in map(int, args.seeds.split(",")):
         for row in rows:
-            results[row, seed] = one(args, base, row, seed)
+            results[row, seed] = one(args, row, seed)
             print(f"{row} seed {seed}: " + json.dumps(results[row, seed]["sets"]), flush=True)
             ordered = list(results.values())
             (args.out / "results.json").write_text(json.dumps(ordered, indent=1) + "\n")
