@@ -45,21 +45,22 @@ fn videos_are_sampled_causally_within_the_gap_and_only_where_seen() {
     let clip = Clip {
         modalities: vec![Modality::Rgb, Modality::Thermal],
         frames: 120,
-        seen: |f, m| if m == Modality::Rgb { f % 3 != 0 } else { f % 2 == 0 },
+        // Both ends are seen, so no base lacks a frame in reach: a base without one would widen the gap.
+        seen: |f, m| match f {
+            0 | 119 => true,
+            _ if m == Modality::Rgb => f % 3 != 0,
+            _ => f % 2 == 0,
+        },
     };
     let s = sampler(vec![Box::new(clip)], false, &config);
     let mut seen_bases = HashSet::new();
-    let mut widened = 0;
     for d in draws(&s, 300) {
         let (base, earlier, search) =
             (d.templates[0].at.frame, d.templates[1].at.frame, d.search.at.frame);
         assert!(earlier < base && base < search, "{}", d.id);
-        // A base with nothing to be seen in reach, as the last ones, widens the gap by 5 for the next.
-        assert!(base - earlier <= 15 && search - base < 15, "{}", d.id);
-        widened += usize::from(base - earlier > 10 || search - base >= 10);
+        assert!(base - earlier <= 10 && search - base < 10, "{}", d.id);
         seen_bases.insert(base);
     }
-    assert!(widened <= 6, "{widened} of 300");
     assert!(seen_bases.len() > 40);
 }
 
