@@ -44,6 +44,8 @@ pub struct BuildOptions {
     pub trained_on: TrainedOn,
     /// What the tracker takes the last frame to say about the next one.
     pub motion: Option<MotionPrior>,
+    /// Score above which a frame becomes a template; that of the configuration when not given.
+    pub remember_above: Option<f32>,
 }
 
 /// A bundle that could not be built. Nothing has been written then.
@@ -61,6 +63,9 @@ pub enum BuildError {
         /// The field.
         source: SpecError,
     },
+    /// A threshold given beside the configuration cannot be used.
+    #[error("tracker: {0}")]
+    Tracker(#[source] SpecError),
     /// The weights cannot be used.
     #[error(transparent)]
     Weights(#[from] WeightsError),
@@ -236,12 +241,17 @@ pub fn build(options: &BuildOptions) -> Result<BuildReport, BuildError> {
     let boxes = probe::default_boxes(&spec);
     sections.push((SectionKind::Probe, probe::capture(&mut BurnEngine::new(&net), &boxes)?));
 
+    let mut tracker = plan.tracker;
+    if let Some(score) = options.remember_above {
+        tracker.write_confidence = score;
+        tracker.validate().map_err(BuildError::Tracker)?;
+    }
     let name = options.name.clone().unwrap_or_else(|| stem(&options.out));
     let card = card.unwrap_or_else(|| format!("# {name}\n\nNo model card was written.\n"));
     let manifest = Manifest {
         name: &name,
         spec,
-        tracker: plan.tracker,
+        tracker,
         trained_on: plan.trained_on,
         calibration: None,
         provenance: Provenance {

@@ -53,6 +53,11 @@ enum Command {
         /// at once. Nothing by default, as in the reference.
         #[arg(long, value_name = "WINDOW,SIZE_RATE")]
         motion: Option<MotionPrior>,
+        /// Score above which the tracker makes a template of a frame, instead of the
+        /// configuration's (imported weights: the reference's 0.9). What is right depends on the
+        /// scores the network gives: `tsda eval --remember-above` finds it.
+        #[arg(long, value_name = "SCORE")]
+        remember_above: Option<f32>,
         /// The bundle to write.
         #[arg(long)]
         out: PathBuf,
@@ -154,6 +159,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
             preset,
             trained_on,
             motion,
+            remember_above,
             out,
             name,
             card,
@@ -179,6 +185,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
                 licence,
                 trained_on,
                 motion,
+                remember_above,
             };
             let report = build(&options)?;
             for (kind, recorded, written) in &report.graphs {

@@ -37,6 +37,7 @@ fn options(weights: &Path, out: &Path, preset: Option<&str>) -> BuildOptions {
         licence: "see the original".into(),
         trained_on: RGB,
         motion: None,
+        remember_above: None,
     }
 }
 

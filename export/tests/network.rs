@@ -121,6 +121,7 @@ fn inputs(dir: &Path, spec: &ModelSpec) -> BuildOptions {
         data_sources: Some(dir.join("d.txt")),
         licence: "CC0-1.0".into(),
         motion: None,
+        remember_above: None,
         trained_on: TrainedOn::default(),
     }
 }

@@ -4,7 +4,7 @@
 use crate::error::HostError;
 use clap::Args;
 use std::fmt;
-use tsda_runtime::{MotionPrior, RedetectOptions, Tracker};
+use tsda_runtime::{MotionPrior, RedetectOptions, Tracker, TrackerParams};
 
 /// A motion prior as typed, or `off`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -21,7 +21,7 @@ impl std::str::FromStr for MotionChoice {
     }
 }
 
-/// `--scan-when-lost`, `--scan-threshold` and `--motion`.
+/// `--scan-when-lost`, `--scan-threshold`, `--motion` and `--remember-above`.
 #[derive(Clone, Copy, Debug, Default, Args)]
 pub struct RedetectArgs {
     /// Look over the whole frame for a target that is lost, N search areas more per frame (the cost
@@ -36,6 +36,10 @@ pub struct RedetectArgs {
     /// distance from there, share of a change of size taken over at once [default: the bundle's]
     #[arg(long, value_name = "WINDOW,SIZE_RATE|off")]
     pub motion: Option<MotionChoice>,
+    /// Score above which a frame becomes a template: lower follows changes of look and sensor sooner,
+    /// higher drifts less [default: the bundle's]
+    #[arg(long, value_name = "SCORE")]
+    pub remember_above: Option<f32>,
 }
 
 impl RedetectArgs {
@@ -51,47 +55,51 @@ impl RedetectArgs {
     /// Checks the values.
     ///
     /// # Errors
-    /// When the threshold is out of range.
+    /// When a threshold is out of range.
     pub fn validate(&self) -> Result<(), HostError> {
-        self.options().map_or(Ok(()), |o| o.validate()).map_err(out_of_range)
+        if let Some(score) = self.remember_above {
+            let params = TrackerParams { write_confidence: score, ..Default::default() };
+            params.validate().map_err(|e| out_of_range("--remember-above", e))?;
+        }
+        let scan = self.options().map_or(Ok(()), |o| o.validate());
+        scan.map_err(|e| out_of_range("--scan-threshold", e))
     }
 
     /// Sets a tracker up.
     ///
     /// # Errors
-    /// When the threshold is out of range.
+    /// When a threshold is out of range.
     pub fn apply<E>(&self, tracker: &mut Tracker<E>) -> Result<(), HostError> {
         if let Some(MotionChoice(motion)) = self.motion {
-            tracker.set_motion_prior(motion).map_err(|e| HostError::Argument {
-                what: "--motion".into(),
-                reason: e.to_string(),
-            })?;
+            tracker.set_motion_prior(motion).map_err(|e| out_of_range("--motion", e))?;
         }
-        tracker.set_redetection(self.options()).map_err(out_of_range)
+        if let Some(score) = self.remember_above {
+            tracker.set_write_confidence(score).map_err(|e| out_of_range("--remember-above", e))?;
+        }
+        tracker.set_redetection(self.options()).map_err(|e| out_of_range("--scan-threshold", e))
     }
 }
 
-fn out_of_range(e: impl fmt::Display) -> HostError {
-    HostError::Argument { what: "--scan-threshold".into(), reason: e.to_string() }
+fn out_of_range(what: &str, e: impl fmt::Display) -> HostError {
+    HostError::Argument { what: what.into(), reason: e.to_string() }
 }
 
 /// What sets results apart from those without the options; empty without them.
 impl fmt::Display for RedetectArgs {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut parts = Vec::new();
         if let Some(options) = self.options() {
             // As JSON, which has every field there is.
             let json = serde_json::to_string(&options).map_err(|_| fmt::Error)?;
-            write!(f, "scan {json}")?;
+            parts.push(format!("scan {json}"));
         }
         match self.motion {
-            None => return Ok(()),
-            Some(_) if self.options().is_some() => f.write_str(", motion ")?,
-            Some(_) => f.write_str("motion ")?,
+            None => {}
+            Some(MotionChoice(None)) => parts.push("motion off".into()),
+            Some(MotionChoice(Some(prior))) => parts.push(format!("motion {prior}")),
         }
-        match self.motion.and_then(|m| m.0) {
-            None => f.write_str("off"),
-            Some(prior) => prior.fmt(f),
-        }
+        parts.extend(self.remember_above.map(|score| format!("remember above {score}")));
+        f.write_str(&parts.join(", "))
     }
 }
 
@@ -130,6 +138,13 @@ mod tests {
             text(&["--scan-when-lost=2", "--motion=off"]),
             "scan {\"positions_per_frame\":2,\"threshold\":0.8}, motion off"
         );
+        assert_eq!(
+            text(&["--remember-above", "0.5", "--motion", "0.3,1"]),
+            "motion 0.3,1, remember above 0.5"
+        );
+        let bad = Program::try_parse_from(["program", "--remember-above=-1"]).expect("a number");
+        let error = bad.redetect.validate().expect_err("negative").to_string();
+        assert!(error.contains("--remember-above") && error.contains("-1"), "{error}");
         assert!(parse(&["--motion", "1.5,1"]).is_err() && parse(&["--motion", "0.3"]).is_err());
         assert!(parse(&["--scan-threshold", "0.8"]).is_err());
         assert!(parse(&["--scan-when-lost=0"]).is_err());

@@ -92,3 +92,38 @@ fn nothing_to_look_at_ends_with_2_and_one_line() {
         assert!(out.stdout.is_empty());
     }
 }
+
+#[test]
+fn what_is_written_is_read_back_as_it_was() {
+    let dir = dataset();
+    let write = |out: &str| {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_tsda"));
+        program.args(["data-write", "rgbt234:set", "--out", out]).current_dir(dir.path());
+        program.output().expect("the program runs")
+    };
+    let first = write("plain");
+    assert_eq!(first.status.code(), Some(0), "{}", text(&first.stderr));
+    let own = dir.path().join("plain/car10");
+    for (folder, letter) in [("visible", 'v'), ("infrared", 'i')] {
+        let boxes = fs::read_to_string(own.join(format!("{folder}.txt"))).expect("boxes");
+        assert_eq!(boxes, "1.000,2.000,3.000,4.000\n0,0,0,0\n1.000,2.000,3.000,4.000\n");
+        for i in 0..3 {
+            let source = dir.path().join(format!("set/car10/{folder}/{i:05}{letter}.jpg"));
+            let source = image::open(source).expect("jpg").into_rgb8();
+            let written = own.join(format!("{folder}/{:06}.png", i + 1));
+            assert_eq!(image::open(written).expect("png").into_rgb8(), source);
+        }
+    }
+    let out = data_check(dir.path(), &["sequences:plain", "--decode", "all"]);
+    let printed = text(&out.stdout);
+    assert_eq!(out.status.code(), Some(0), "{printed}");
+    assert!(printed.contains("3 annotated, of these 1 absent"), "{printed}");
+
+    // A run that is called again leaves what is there, and says what it cannot write.
+    fs::write(own.join("visible.txt"), "mine\n").expect("edit");
+    assert_eq!(write("plain").status.code(), Some(0));
+    assert_eq!(fs::read_to_string(own.join("visible.txt")).expect("boxes"), "mine\n");
+    let into_file = write("plain/index.json");
+    assert_eq!(into_file.status.code(), Some(2), "{}", text(&into_file.stderr));
+    assert!(text(&into_file.stderr).contains("index.json"));
+}

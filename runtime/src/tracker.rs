@@ -381,6 +381,17 @@ impl<E> Tracker<E> {
         self.motion
     }
 
+    /// Changes the score above which a frame is remembered ([`TrackerParams::write_confidence`]).
+    ///
+    /// # Errors
+    /// When it is negative or not finite; the old one then stays.
+    pub fn set_write_confidence(&mut self, score: f32) -> Result<(), SpecError> {
+        let params = TrackerParams { write_confidence: score, ..self.params };
+        params.validate()?;
+        self.params = params;
+        Ok(())
+    }
+
     /// The network's shape.
     pub const fn spec(&self) -> &ModelSpec {
         &self.spec

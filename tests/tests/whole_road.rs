@@ -93,6 +93,7 @@ fn bundle_of(weights: PathBuf, run: &Path, out: &Path) {
         licence: "none".into(),
         trained_on: Default::default(),
         motion: None,
+        remember_above: None,
     })
     .unwrap();
 }

@@ -7,6 +7,8 @@ mod calibrate;
 mod compare;
 #[cfg(feature = "eval")]
 mod data_check;
+#[cfg(feature = "eval")]
+mod data_write;
 mod demo;
 #[cfg(feature = "camera")]
 mod devices;
@@ -88,6 +90,9 @@ pub enum Command {
     /// Look through a dataset: counts, absences, resolutions, attributes, broken files
     #[cfg(feature = "eval")]
     DataCheck(data_check::DataCheckArgs),
+    /// Write a dataset, or clips made from stills, as folders that other programs can read
+    #[cfg(feature = "eval")]
+    DataWrite(data_write::DataWriteArgs),
     /// Score one result file against its truth, by a benchmark's own rules
     #[cfg(feature = "eval")]
     Score(ScoreArgs),
@@ -278,6 +283,8 @@ pub fn execute(cli: &Cli) -> Result<u8, HostError> {
         Command::Render(args) => render::run(args),
         #[cfg(feature = "eval")]
         Command::DataCheck(args) => data_check::run(args),
+        #[cfg(feature = "eval")]
+        Command::DataWrite(args) => data_write::run(args),
         #[cfg(feature = "eval")]
         Command::Score(args) => score::run(args),
         #[cfg(feature = "eval")]
