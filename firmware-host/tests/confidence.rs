@@ -17,19 +17,56 @@ fn tsda(dir: &Path, args: &[&str]) -> String {
     text
 }
 
+/// A thermal sequence: the drawn clip for 10 frames, then an empty picture for 40, then 15 with the
+/// target alone, at the other end of the picture. Nothing else in it could be taken for the target.
+fn vanishing(dir: &Path) {
+    use tsda_host::picture::Picture;
+    let clip = tsda_host::render::Clip::new(tsda_host::render::ClipConfig::default());
+    let folder = dir.join("set/gone/infrared");
+    std::fs::create_dir_all(&folder).expect("mkdir");
+    let (mut source, mut boxes) = (Picture::default(), String::new());
+    for i in 0..65 {
+        let seen = if i < 50 { i.min(10) } else { i - 50 };
+        clip.render(seen, tsda_runtime::Modality::Thermal, &mut source);
+        let b = clip.truth(seen);
+        let mut shown = source.clone();
+        let (mut x, shift) = (b.x, (200.0 - b.x) as usize);
+        if i >= 10 {
+            shown.data.fill(90);
+        }
+        if i >= 50 {
+            x += shift as f32;
+            for row in (b.y as usize - 5)..(b.y + b.h) as usize + 5 {
+                let at = row * source.width + b.x as usize - 5;
+                let patch = &source.data[at..at + b.w as usize + 10];
+                shown.data[at + shift..][..patch.len()].copy_from_slice(patch);
+            }
+        }
+        boxes += &match (10..50).contains(&i) {
+            true => "0,0,0,0\n".to_owned(),
+            false => format!("{x},{},{},{}\n", b.y, b.w, b.h),
+        };
+        let (w, h) = (shown.width as u32, shown.height as u32);
+        let picture = image::GrayImage::from_raw(w, h, shown.data).expect("grey");
+        picture.save(folder.join(format!("{i:03}.png"))).expect("png");
+    }
+    std::fs::write(dir.join("set/gone/infrared.txt"), boxes).expect("boxes");
+}
+
 #[test]
 fn the_scan_finds_a_target_that_comes_out_elsewhere() {
     let dir = tempfile::tempdir().expect("temp");
+    vanishing(dir.path());
     let figures = |more: &[&str]| {
-        let base = ["presence", "--dataset", "rendered:7", "--protocol", "t", "--json", "p.json"];
+        let base =
+            ["presence", "--dataset", "sequences:set", "--protocol", "t", "--json", "p.json"];
         println!("{more:?}\n{}", tsda(dir.path(), &[&base, more].concat()));
         let text = std::fs::read_to_string(dir.path().join("p.json")).expect("written");
         let rows: serde_json::Value = serde_json::from_str(&text).expect("JSON");
         rows[0].clone()
     };
     let without = figures(&[]);
-    // Below the default, at which this clip's target stays lost (docs/results/confidence.md).
-    let with = figures(&["--scan-when-lost", "--scan-threshold", "0.7"]);
+    let with = figures(&["--scan-when-lost", "--scan-threshold", "0.6"]);
     assert_eq!(without["redetected"]["changes"], 1);
     assert_eq!((&without["redetected"]["came"], &without["found_by_scan"]), (&0.into(), &0.into()));
     assert_eq!((&with["redetected"]["came"], &with["found_by_scan"]), (&1.into(), &1.into()));
