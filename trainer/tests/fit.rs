@@ -191,6 +191,82 @@ fn a_run_in_two_halves_ends_with_the_same_bits_whatever_the_workers() {
 }
 
 #[test]
+fn a_run_with_several_batches_per_step_resumes_to_the_bit() {
+    let bench = Bench::new();
+    let three = CONFIG.replace("batch = 2", "batch = 2\naccumulate = 3");
+    bench.config("three.toml", &(three + "[align]\npreset = \"joint\"\nstart_step = 1\n"));
+    let whole = bench.trained("three.toml", "whole", &[]);
+    let stopped = bench.fit("three.toml", "halves", &["--stop-after", "3"]);
+    assert!(stopped.status.success(), "{}", text(&stopped));
+    assert!(bench.trained("three.toml", "halves", &["--resume"]) == whole);
+    let entries = log(&bench.path("whole"));
+    assert_eq!(entries.iter().filter(|e| e["event"] == "train").count(), 6, "optimiser steps");
+    assert_eq!((&entries[0]["batch"], &entries[0]["accumulate"]), (&2.into(), &3.into()));
+
+    // The command line says the same as the file, and other numbers train other weights.
+    bench
+        .config("one.toml", &(CONFIG.to_owned() + "[align]\npreset = \"joint\"\nstart_step = 1\n"));
+    assert!(bench.trained("one.toml", "flag", &["--accumulate", "3"]) == whole);
+    assert!(bench.trained("one.toml", "one", &[]) != whole);
+
+    bench.refused("one.toml", "o", &["--accumulate", "0"], &["run.accumulate = 0"]);
+    bench.refused("one.toml", "o", &["--devices", "2"], &["--devices 2", "the CPU is one device"]);
+    for device in ["wgpu", "cuda"].into_iter().filter(|d| !has(d)) {
+        bench.refused("one.toml", "o", &["--device", device], &[device, "built without"]);
+    }
+}
+
+/// Was the program built with this device?
+fn has(device: &str) -> bool {
+    (device == "wgpu" && cfg!(feature = "wgpu")) || (device == "cuda" && cfg!(feature = "cuda"))
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn a_run_on_a_graphics_device_learns_and_resumes() {
+    let bench = Bench::new();
+    let mobile = CONFIG
+        .lines()
+        .filter(|line| !line.starts_with("backbone = "))
+        .collect::<Vec<_>>()
+        .join("\n")
+        .replace("steps = 6", "steps = 24")
+        .replace("validate_every = 3", "validate_every = 12");
+    bench.config("gpu.toml", &mobile);
+    let flags = ["--device", "wgpu", "--accumulate", "2"];
+    let output = bench.fit("gpu.toml", "whole", &flags);
+    let all = text(&output);
+    if all.contains("no usable graphics device") && std::env::var_os("TSDA_REQUIRE_WGPU").is_none()
+    {
+        println!("skipped: {all}");
+        return;
+    }
+    assert!(output.status.success(), "{all}");
+    let entries = log(&bench.path("whole"));
+    let losses: Vec<f64> = entries
+        .iter()
+        .filter(|e| e["event"] == "train")
+        .filter_map(|e| e["loss"].as_f64())
+        .collect();
+    println!("losses {losses:.3?}");
+    let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
+    assert!(losses.len() == 24 && mean(&losses[20..]) < 0.8 * mean(&losses[..4]), "{losses:?}");
+    assert_eq!(entries.iter().filter(|e| e["event"] == "validation").count(), 2);
+
+    let stop = [&flags[..], &["--stop-after", "10"]].concat();
+    assert!(bench.fit("gpu.toml", "halves", &stop).status.success());
+    let resumed = bench.trained("gpu.toml", "halves", &[&flags[..], &["--resume"]].concat());
+    let whole = std::fs::read(bench.path("whole/model.safetensors")).unwrap();
+    println!("resumed to the bit: {}", resumed == whole);
+    let last = |out: &str| {
+        let entries = log(&bench.path(out));
+        entries.iter().rfind(|e| e["event"] == "train").and_then(|e| e["loss"].as_f64()).unwrap()
+    };
+    let (whole, resumed) = (last("whole"), last("halves"));
+    assert!((whole - resumed).abs() < 0.02 * whole, "{whole} {resumed}");
+}
+
+#[test]
 fn a_damaged_newest_checkpoint_and_leftovers_do_not_stop_a_resume() {
     let bench = Bench::new();
     let whole = bench.trained("c.toml", "whole", &[]);
