@@ -114,8 +114,8 @@ fn losses_and_gradients_equal_those_of_the_cpu() {
     // One network per backbone family.
     let cases = [
         ("ResNet", small(true), sensors(golden_batch())),
-        ("EfficientNet-Lite0", nano.clone(), batch(&nano)),
-        ("MobileNetV3", pico.clone(), batch(&pico)),
+        ("EfficientNet-Lite0", nano, batch(&nano)),
+        ("MobileNetV3", pico, batch(&pico)),
     ];
     for (name, spec, batch) in cases {
         let batches = [batch];
