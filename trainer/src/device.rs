@@ -46,6 +46,26 @@ impl DeviceName {
         let first = all.remove(0);
         Ok((first, all))
     }
+
+    /// Checks that a checkpoint can be loaded. burn puts an optimiser's state on its default device
+    /// first, the graphics device of a program that has that feature, and panics where there is none.
+    ///
+    /// # Errors
+    /// Says how to make the CPU the default.
+    pub fn check_resume(self) -> Result<()> {
+        let chosen = std::env::var_os("BURN_DEVICE").is_some();
+        if self != Self::Flex || chosen || !cfg!(feature = "wgpu") || cfg!(feature = "cuda") {
+            return Ok(());
+        }
+        match wgpu() {
+            Ok(_) => Ok(()),
+            Err(_) => bail!(
+                "--resume: this program has the feature wgpu, and burn loads a checkpoint by way of a \
+                 graphics device, of which there is none; set the environment variable \
+                 BURN_DEVICE=flex"
+            ),
+        }
+    }
 }
 
 /// The adapter that WebGPU prefers; `CUBECL_WGPU_DEFAULT_DEVICE` chooses another.

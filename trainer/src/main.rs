@@ -229,6 +229,9 @@ fn run_fit(args: &FitArgs) -> Result<()> {
         experiment.run.accumulate = count;
     }
     experiment.validate().context("command line")?;
+    if args.resume {
+        args.device.check_resume()?;
+    }
     let (device, more_devices) = args.device.open_several(args.devices)?;
     let options = FitOptions {
         resume: args.resume,
