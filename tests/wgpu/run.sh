@@ -35,6 +35,6 @@ if [ "$(uname -s)" != Linux ] || { have_driver && have_loader; }; then
   export TSDA_REQUIRE_WGPU=1
 fi
 
-# One at a time: a software device uses all cores, and its pipelines live in one process each.
+# One at a time: a software device uses all cores.
 cargo test --workspace --locked --features tsda-trainer/wgpu --lib "$@" wgpu_tests -- --show-output --test-threads 1
 exec cargo test --workspace --locked --features tsda-trainer/wgpu --test fit "$@" graphics_device -- --show-output
