@@ -97,10 +97,16 @@ fn two_batches_of_four_have_the_gradients_of_one_of_eight() {
     half.region[4 * cells..].fill(false);
     let mut none = whole.clone();
     none.region.fill(false);
-    for (what, batch) in [("even", whole), ("uneven", uneven), ("half", half), ("none", none)] {
+    let cases = [
+        ("even", whole, &[2, 4][..]),
+        ("uneven", uneven, &[2]),
+        ("half", half, &[4]),
+        ("none", none, &[2]),
+    ];
+    for (what, batch, counts) in cases {
         let state = state(&experiment, true);
         let (one, one_figures) = run(&state, std::slice::from_ref(&batch), &experiment);
-        for count in [2, 4] {
+        for &count in counts {
             let (many, figures) = run(&state, &parts(&batch, count), &experiment);
             let dict = |g: &Gradients| model::gradients(&state.net, &g.net);
             let (off, name) = worst(&dict(&many), &dict(&one));
@@ -174,5 +180,18 @@ fn several_devices_take_the_step_of_one() {
             statistics += usize::from(own);
         }
         assert_eq!(statistics, 4);
+    }
+}
+
+#[test]
+fn batches_that_cannot_be_spread_evenly_are_refused() {
+    let options = FitOptions { more_devices: vec![Device::flex(); 2], ..Default::default() };
+    for accumulate in [1, 2, 4] {
+        let mut experiment = Experiment::default();
+        experiment.run.accumulate = accumulate;
+        let e = fit(&experiment, &options).unwrap_err();
+        assert!(matches!(e, FitError::Devices { devices: 3, .. }), "{e}");
+        let text = e.to_string();
+        assert!(text.contains(&format!("run.accumulate = {accumulate} cannot")), "{text}");
     }
 }
