@@ -1,8 +1,10 @@
 //! `tsda-train`: trains trackers. See `docs/training.md`.
 
+mod device;
+
 use anyhow::{Context, Result, bail};
-use burn::tensor::Device;
-use clap::{Parser, Subcommand, ValueEnum};
+use clap::{Parser, Subcommand};
+use device::DeviceName;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -79,14 +81,13 @@ struct FitArgs {
     /// Where to compute.
     #[arg(long, value_enum, default_value_t = DeviceName::Flex)]
     device: DeviceName,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum DeviceName {
-    /// The CPU.
-    Flex,
-    /// A GPU through WebGPU/Vulkan (needs the cargo feature `wgpu`).
-    Wgpu,
+    /// How many devices of that kind share the batches of a step; run.accumulate has to be a
+    /// multiple. The CPU is one device, whatever its cores.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    devices: usize,
+    /// Batches per optimiser step instead of the configuration's.
+    #[arg(long, value_name = "N")]
+    accumulate: Option<usize>,
 }
 
 #[derive(clap::Args)]
@@ -204,16 +205,6 @@ fn load(source: &Source) -> Result<Experiment> {
     Ok(experiment)
 }
 
-fn device(name: DeviceName) -> Result<Device> {
-    match name {
-        DeviceName::Flex => Ok(Device::flex()),
-        #[cfg(feature = "wgpu")]
-        DeviceName::Wgpu => Ok(Device::wgpu(Default::default())),
-        #[cfg(not(feature = "wgpu"))]
-        DeviceName::Wgpu => bail!("--device wgpu: this program was built without the feature wgpu"),
-    }
-}
-
 fn run_fit(args: &FitArgs) -> Result<()> {
     let mut experiment = load(&args.source)?;
     if let Some(out) = &args.out {
@@ -234,12 +225,20 @@ fn run_fit(args: &FitArgs) -> Result<()> {
     if let Some(step) = args.align_start {
         experiment.align.start_step = Some(step);
     }
+    if let Some(count) = args.accumulate {
+        experiment.run.accumulate = count;
+    }
     experiment.validate().context("command line")?;
+    if args.resume {
+        args.device.check_resume()?;
+    }
+    let (device, more_devices) = args.device.open_several(args.devices)?;
     let options = FitOptions {
         resume: args.resume,
         stop_after: args.stop_after,
         stop: stop_on_signal()?,
-        device: device(args.device)?,
+        device,
+        more_devices,
         verbose: true,
     };
     match fit::fit(&experiment, &options)? {
@@ -329,7 +328,7 @@ fn run_align(args: AlignArgs) -> Result<()> {
         pairs: args.pairs,
         seed: args.seed,
         batch: args.batch,
-        device: device(args.device)?,
+        device: args.device.open()?,
     };
     let bar = indicatif::ProgressBar::new(args.pairs as u64);
     let found = align_report::run(&experiment, &options, |done| bar.set_position(done as u64))?;

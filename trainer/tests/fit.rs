@@ -191,6 +191,77 @@ fn a_run_in_two_halves_ends_with_the_same_bits_whatever_the_workers() {
 }
 
 #[test]
+fn a_run_with_several_batches_per_step_resumes_to_the_bit() {
+    let bench = Bench::new();
+    let three = CONFIG.replace("batch = 2", "batch = 2\naccumulate = 3");
+    bench.config("three.toml", &(three + "[align]\npreset = \"joint\"\nstart_step = 1\n"));
+    let whole = bench.trained("three.toml", "whole", &[]);
+    let stopped = bench.fit("three.toml", "halves", &["--stop-after", "3"]);
+    assert!(stopped.status.success(), "{}", text(&stopped));
+    assert!(bench.trained("three.toml", "halves", &["--resume"]) == whole);
+    let entries = log(&bench.path("whole"));
+    assert_eq!(entries.iter().filter(|e| e["event"] == "train").count(), 6, "optimiser steps");
+    assert_eq!((&entries[0]["batch"], &entries[0]["accumulate"]), (&2.into(), &3.into()));
+
+    // The command line says the same as the file, and other numbers train other weights.
+    bench
+        .config("one.toml", &(CONFIG.to_owned() + "[align]\npreset = \"joint\"\nstart_step = 1\n"));
+    assert!(bench.trained("one.toml", "flag", &["--accumulate", "3"]) == whole);
+    assert!(bench.trained("one.toml", "one", &[]) != whole);
+
+    bench.refused("one.toml", "o", &["--accumulate", "0"], &["run.accumulate = 0"]);
+    bench.refused("one.toml", "o", &["--devices", "2"], &["--devices 2", "the CPU is one device"]);
+    for device in ["wgpu", "cuda"].into_iter().filter(|d| !has(d)) {
+        bench.refused("one.toml", "o", &["--device", device], &[device, "built without"]);
+    }
+}
+
+/// Was the program built with this device?
+fn has(device: &str) -> bool {
+    (device == "wgpu" && cfg!(feature = "wgpu")) || (device == "cuda" && cfg!(feature = "cuda"))
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn a_run_on_a_graphics_device_stopped_and_resumed_goes_where_the_cpu_goes() {
+    let bench = Bench::new();
+    // Generators of random numbers differ, so one start for both, and no dropout.
+    bench.trained("c.toml", "start", &["--steps", "1"]);
+    let config = CONFIG.replace("[optim]", "[optim]\ndropout = 0.0\nattention_dropout = 0.0")
+        + "[init]\nweights = \"start/model.safetensors\"\n";
+    bench.config("same.toml", &config);
+    bench.trained("same.toml", "cpu", &["--accumulate", "2"]);
+    let flags = |last: &[&'static str]| [&["--device", "wgpu", "--accumulate", "2"], last].concat();
+    let stopped = bench.fit("same.toml", "gpu", &flags(&["--stop-after", "3"]));
+    let all = text(&stopped);
+    if all.contains("no usable graphics device") && std::env::var_os("TSDA_REQUIRE_WGPU").is_none()
+    {
+        println!("skipped: {all}");
+        return;
+    }
+    assert!(stopped.status.success(), "{all}");
+    bench.trained("same.toml", "gpu", &flags(&["--resume"]));
+    let figures = |out: &str| -> Vec<(String, f64)> {
+        let entries = log(&bench.path(out));
+        let trained = entries.iter().filter(|e| e["event"] == "train");
+        let validated = entries.iter().filter(|e| e["event"] == "validation");
+        let of = |what: &str, e: &serde_json::Value, value: &serde_json::Value| {
+            (format!("{what} at step {}", e["step"]), value.as_f64().unwrap())
+        };
+        trained
+            .map(|e| of("loss", e, &e["loss"]))
+            .chain(validated.map(|e| of("validation", e, &e["all"]["giou"])))
+            .collect()
+    };
+    let (cpu, gpu) = (figures("cpu"), figures("gpu"));
+    assert_eq!((cpu.len(), gpu.len()), (8, 8));
+    for ((what, cpu), (_, gpu)) in cpu.iter().zip(&gpu) {
+        println!("{what}: {gpu:.6} against {cpu:.6} on the CPU");
+        assert!((gpu - cpu).abs() <= 1e-2 * cpu, "{what}: {gpu} against {cpu}");
+    }
+}
+
+#[test]
 fn a_damaged_newest_checkpoint_and_leftovers_do_not_stop_a_resume() {
     let bench = Bench::new();
     let whole = bench.trained("c.toml", "whole", &[]);

@@ -381,8 +381,10 @@ pub struct RunConfig {
     pub steps: u64,
     /// Epochs of `sampler.samples_per_epoch` samples, used when `steps` is 0.
     pub epochs: u64,
-    /// Samples per step.
+    /// Samples per forward pass; what in-batch negatives and batch statistics are taken over.
     pub batch: usize,
+    /// Batches per optimiser step. The step's gradient is that of the mean over all their samples.
+    pub accumulate: usize,
     /// Seed of everything random.
     pub seed: u64,
     /// Threads that prepare batches.
@@ -407,6 +409,7 @@ impl Default for RunConfig {
             steps: 0,
             epochs: 1,
             batch: 16,
+            accumulate: 1,
             seed: 1,
             workers: 2,
             out: PathBuf::from("out"),
@@ -416,6 +419,13 @@ impl Default for RunConfig {
             validate_every: 500,
             validation_samples: 128,
         }
+    }
+}
+
+impl RunConfig {
+    /// Samples that an optimiser step sees, at least 1.
+    pub fn samples_per_step(&self) -> u64 {
+        (self.batch as u64).saturating_mul(self.accumulate as u64).max(1)
     }
 }
 
@@ -434,13 +444,13 @@ impl Experiment {
             return self.run.steps;
         }
         let samples = self.run.epochs.saturating_mul(self.sampler.samples_per_epoch as u64);
-        samples.div_ceil(self.run.batch.max(1) as u64)
+        samples.div_ceil(self.run.samples_per_step())
     }
 
     /// First step with alignment losses (0-based), whether or not the run has any.
     pub fn align_start(&self) -> u64 {
         let samples = self.align.start_epoch.saturating_mul(self.sampler.samples_per_epoch as u64);
-        self.align.start_step.unwrap_or_else(|| samples.div_ceil(self.run.batch.max(1) as u64))
+        self.align.start_step.unwrap_or_else(|| samples.div_ceil(self.run.samples_per_step()))
     }
 
     /// Share of the alignment weights in force at a step, 0 to 1; `None` before alignment starts

@@ -256,6 +256,7 @@ fn check_align(e: &Experiment) -> Result<(), FieldError> {
 
 fn check_run(r: &RunConfig) -> Result<(), FieldError> {
     count("run.batch", r.batch as u64, 1, 4096)?;
+    count("run.accumulate", r.accumulate as u64, 1, 4096)?;
     count("run.workers", r.workers as u64, 1, 256)?;
     count("run.checkpoint_every", r.checkpoint_every, 1, u64::MAX)?;
     count("run.keep", r.keep as u64, 1, 10_000)?;

@@ -20,6 +20,27 @@ pub(super) struct Alignment {
     optimizer: ModuleOptimizer,
 }
 
+/// Gradients of both branches, summed over a step's batches; empty for a branch that is off.
+#[derive(Default)]
+pub(super) struct AlignGradients {
+    pub discriminator: GradientsParams,
+    pub projection: GradientsParams,
+}
+
+impl AlignGradients {
+    /// Adds those of a batch, wherever they were computed. `branches` live on `device`.
+    pub fn add(&mut self, step: AlignStep, branches: &Branches, device: &Device) {
+        for (sum, more) in
+            [(&mut self.discriminator, step.discriminator), (&mut self.projection, step.projection)]
+        {
+            if let Some(more) = more {
+                let more = more.to_device(device, branches);
+                *sum = optim::add(branches, std::mem::take(sum), more);
+            }
+        }
+    }
+}
+
 impl Alignment {
     /// Fresh branches, from the seed alone; `None` for runs without. Without a draw for the network,
     /// rows of an ablation start from the same network.
@@ -30,19 +51,20 @@ impl Alignment {
     }
 
     /// Norms of the gradients by the names they have in logs.
-    pub fn gradient_norms(&self, step: &AlignStep) -> Vec<(&'static str, f32)> {
-        [
-            ("discriminator_grad_norm", &step.discriminator),
-            ("projection_grad_norm", &step.projection),
-        ]
-        .into_iter()
-        .filter_map(|(name, g)| g.as_ref().map(|g| (name, optim::gradient_norm(&self.branches, g))))
-        .collect()
+    pub fn gradient_norms(&self, of: &AlignGradients) -> Vec<(&'static str, f32)> {
+        [("discriminator_grad_norm", &of.discriminator), ("projection_grad_norm", &of.projection)]
+            .into_iter()
+            .filter(|(_, gradients)| !gradients.is_empty())
+            .map(|(name, gradients)| (name, optim::gradient_norm(&self.branches, gradients)))
+            .collect()
     }
 
     /// One optimiser step, every branch clipped on its own.
-    pub fn update(&mut self, rate: f64, step: AlignStep, clip: f64) {
-        for gradients in [step.discriminator, step.projection].into_iter().flatten() {
+    pub fn update(&mut self, rate: f64, of: AlignGradients, clip: f64) {
+        for gradients in [of.discriminator, of.projection] {
+            if gradients.is_empty() {
+                continue;
+            }
             let norm = optim::gradient_norm(&self.branches, &gradients);
             let gradients: GradientsParams = optim::clip(&self.branches, gradients, norm, clip);
             // Parameters without a gradient, those of the other branch, stay as they are.

@@ -4,17 +4,22 @@
 //! generator, which dropout reads. Learning rates are a function of the step. So a run that was
 //! stopped and resumed ends with the same weights, bit for bit, as one that was not.
 
+#[cfg(test)]
+mod accumulate_tests;
 mod alignment;
 mod curves;
 mod evaluate;
 mod optim;
 mod progress;
+mod replica;
 mod state;
 mod step;
 #[cfg(test)]
 mod step_tests;
 mod tensors;
 mod throughput;
+#[cfg(all(test, feature = "wgpu"))]
+mod wgpu_tests;
 
 pub use evaluate::{Group, Validation, best_box};
 pub use optim::lr_factor;
@@ -28,7 +33,7 @@ use crate::logging::RunLog;
 use crate::losses::LossWeights;
 use crate::model::{NetOptions, TrackerNet};
 use crate::prefetch::{PrefetchError, Prefetcher};
-use crate::processing::{BatchMaker, Processor};
+use crate::processing::{Batch, BatchMaker, Processor};
 use crate::sampler::{PictureCache, SampleError, Sampler};
 use burn::module::Module;
 use burn::prelude::*;
@@ -124,6 +129,18 @@ pub enum FitError {
         /// Samples of the batch.
         ids: Vec<String>,
     },
+    /// Batches cannot be spread evenly over the devices.
+    #[error(
+        "run.accumulate = {accumulate} cannot be spread over {devices} devices: every optimiser step \
+         is run.accumulate batches of run.batch samples, batch k on device k modulo {devices}; make it \
+         a multiple of {devices} (and run.batch smaller, to keep the samples of a step)"
+    )]
+    Devices {
+        /// `run.accumulate`.
+        accumulate: usize,
+        /// Devices given.
+        devices: usize,
+    },
     /// The compute device failed.
     #[error("device: {0}")]
     Device(String),
@@ -142,8 +159,11 @@ pub struct FitOptions {
     pub stop_after: Option<u64>,
     /// Set from outside to stop after the step under way, with a checkpoint.
     pub stop: Arc<AtomicBool>,
-    /// Where to compute; autodiff is added here.
+    /// Where to compute; autodiff is added here. Weights, optimiser and validation live here.
     pub device: Device,
+    /// Further devices that take their share of a step's batches; `run.accumulate` has to be a
+    /// multiple of their number plus one.
+    pub more_devices: Vec<Device>,
     /// Print progress.
     pub verbose: bool,
 }
@@ -155,6 +175,7 @@ impl Default for FitOptions {
             stop_after: None,
             stop: Arc::default(),
             device: Device::flex(),
+            more_devices: Vec::new(),
             verbose: false,
         }
     }
@@ -196,6 +217,8 @@ struct RunEntry {
     parameters: usize,
     sequences: usize,
     batch: usize,
+    accumulate: usize,
+    devices: usize,
     total_steps: u64,
 }
 
@@ -273,14 +296,21 @@ pub fn initial_net(experiment: &Experiment, device: &Device) -> Result<TrackerNe
 pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, FitError> {
     let run = &experiment.run;
     let total = experiment.total_steps();
+    let devices: Vec<Device> = std::iter::once(&options.device)
+        .chain(&options.more_devices)
+        .map(|device| device.clone().autodiff())
+        .collect();
+    if !run.accumulate.is_multiple_of(devices.len()) {
+        return Err(FitError::Devices { accumulate: run.accumulate, devices: devices.len() });
+    }
     let store = CheckpointStore::new(&run.out, run.keep);
     if !options.resume && store.any()? {
         return Err(FitError::Exists { out: run.out.clone() });
     }
     let maker = Arc::new(training_batches(experiment)?);
     let validation = validation_batches(experiment)?;
-    let device = options.device.clone().autodiff();
-    let mut state = State::start(experiment, initial_net(experiment, &device)?, &device);
+    let device = &devices[0];
+    let mut state = State::start(experiment, initial_net(experiment, device)?, device);
     let mut notes = Vec::new();
     if options.resume {
         let latest = store.latest()?;
@@ -302,6 +332,8 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
         parameters: state.net.num_params(),
         sequences: maker.sampler().sequences(),
         batch: run.batch,
+        accumulate: run.accumulate,
+        devices: devices.len(),
         total_steps: total,
     };
     let event = if state.step > 0 { "resume" } else { "start" };
@@ -313,26 +345,30 @@ pub fn fit(experiment: &Experiment, options: &FitOptions) -> Result<Outcome, Fit
     let weights = LossWeights { classification: experiment.loss.cls, giou: experiment.loss.reg };
     let backbone = optim::backbone_group().map_err(FitError::Device)?;
     let source = maker.clone();
-    let mut batches = Prefetcher::new(state.step..end, run.workers, run.workers + 1, move |step| {
-        source.step(step)
-    })
-    .map_err(|source| FitError::Batch { step: state.step, source })?;
-    let mut window = Window::new(run.batch);
+    let per_step = run.accumulate as u64;
+    // While a step computes, the batches of the next one are prepared.
+    let ahead = run.workers + run.accumulate;
+    let range = state.step * per_step..end * per_step;
+    let mut batches = Prefetcher::new(range, run.workers, ahead, move |i| source.step(i))
+        .map_err(|source| FitError::Batch { step: state.step, source })?;
+    let mut window = Window::new(run.batch * run.accumulate);
     let mut last = None;
     let mut saved = state.step;
     while state.step < end && !options.stop.load(Ordering::Relaxed) {
         let waited = Instant::now();
-        let Some(batch) = batches.next() else { break };
-        let batch = batch.map_err(|source| FitError::Batch { step: state.step, source })?;
-        window.wait(waited.elapsed());
         let step = state.step;
-        device.seed(mix(run.seed, step));
+        let batches: Vec<Batch> = batches
+            .by_ref()
+            .take(run.accumulate)
+            .collect::<Result<_, _>>()
+            .map_err(|source| FitError::Batch { step, source })?;
+        window.wait(waited.elapsed());
         let factor = lr_factor(&experiment.optim, step, total);
         let rates = Rates {
             net: optim::learning_rate(&experiment.optim, &backbone, factor),
             align: experiment.align.lr.unwrap_or(experiment.optim.lr_head) * factor,
         };
-        let figures = match train_step(&mut state, &batch, experiment, weights, rates, &device) {
+        let figures = match train_step(&mut state, &batches, experiment, weights, rates, &devices) {
             Ok(figures) => figures,
             Err(e) => {
                 if let FitError::NotFinite { what, ids, .. } = &e {

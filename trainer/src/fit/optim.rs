@@ -3,7 +3,7 @@
 use crate::config::{OptimConfig, ScheduleConfig};
 use burn::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param, ParamGroup, ParamId};
-use burn::optim::{AdamWConfig, GradientsParams, ModuleOptimizer};
+use burn::optim::{AdamWConfig, GradientsAccumulator, GradientsParams, ModuleOptimizer};
 use burn::prelude::*;
 use std::collections::HashMap;
 
@@ -107,6 +107,18 @@ impl ModuleVisitor for Scale<'_> {
             self.gradients.register(param.id, g.mul_scalar(self.factor));
         }
     }
+}
+
+/// Sum of the gradients of two backward passes of a module.
+pub(super) fn add<M: Module>(
+    module: &M,
+    sum: GradientsParams,
+    more: GradientsParams,
+) -> GradientsParams {
+    let mut accumulator = GradientsAccumulator::new();
+    accumulator.accumulate(module, sum);
+    accumulator.accumulate(module, more);
+    accumulator.grads()
 }
 
 /// Euclidean norm of all gradients together; 0 without any.

@@ -132,6 +132,7 @@ fn changes(then: &Experiment, now: &Experiment) -> Vec<String> {
         ("optim", then.optim != now.optim),
         ("run.seed", then.run.seed != now.run.seed),
         ("run.batch", then.run.batch != now.run.batch),
+        ("run.accumulate", then.run.accumulate != now.run.accumulate),
         ("run.steps", then.total_steps() != now.total_steps()),
     ];
     tables

@@ -18,13 +18,13 @@ use tsda_runtime::BBox;
 
 /// Gradients without a mathematical value: biases in front of a batch norm, which takes them out
 /// again. What is left is rounding noise.
-const NOISE: [&str; 2] =
+pub(super) const NOISE: [&str; 2] =
     ["head.filter_predictor.box_encoding.0.bias", "head.filter_predictor.box_encoding.3.bias"];
 /// Weights on the zero token: no gradient at all (spec 2.6).
 const DEAD: &str = "head.filter_predictor.transformer.decoder.layers.0.self_attn.in_proj_weight";
 
 /// The three golden sequences.
-fn golden_batch() -> Batch {
+pub(super) fn golden_batch() -> Batch {
     let (dict, spec) = (compact(), small(true));
     let each = |name: &str| -> Vec<f32> {
         (0..3).flat_map(|q| dict.get(&format!("seq{q}.{name}")).unwrap().values.clone()).collect()
@@ -144,7 +144,7 @@ fn stepped(experiment: &Experiment) -> StateDict {
     let rates = Rates { net: net_rate, align: experiment.optim.lr_head };
     let weights = LossWeights { classification: experiment.loss.cls, giou: experiment.loss.reg };
     let figures =
-        train_step(&mut state, &golden_batch(), experiment, weights, rates, &device).unwrap();
+        train_step(&mut state, &[golden_batch()], experiment, weights, rates, &[device]).unwrap();
     assert!((figures.loss - 322.776).abs() < 1e-2, "{figures:?}");
     state_dict(&state.net.valid())
 }
@@ -308,7 +308,8 @@ fn a_step_with_alignment_moves_both_branches_and_reports_them() {
             align: 1e-3,
         };
         let weights = LossWeights::default();
-        let figures = train_step(&mut state, batch, experiment, weights, rates, &device);
+        let (batch, devices) = (std::slice::from_ref(batch), std::slice::from_ref(&device));
+        let figures = train_step(&mut state, batch, experiment, weights, rates, devices);
         (figures, before, state)
     };
     let mut batch = golden_batch();
@@ -368,9 +369,10 @@ fn a_step_that_is_not_finite_changes_nothing() {
     };
     let batch = golden_batch();
     let weights = LossWeights::default();
-    let e = train_step(&mut state, &batch, &experiment, weights, rates, &device).unwrap_err();
-    let FitError::NotFinite { what, ids, .. } = e else { panic!("{e}") };
-    assert_eq!((what, ids), ("alignment loss", batch.ids));
+    let ids = batch.ids.clone();
+    let e = train_step(&mut state, &[batch], &experiment, weights, rates, &[device]).unwrap_err();
+    let FitError::NotFinite { what, ids: named, .. } = e else { panic!("{e}") };
+    assert_eq!((what, named), ("alignment loss", ids));
     let after = state_dict(&state.net.valid());
     for (name, tensor) in before.iter() {
         // Statistics of the box MLP follow the forward pass.

@@ -26,8 +26,10 @@ pub(super) struct StepTimes {
 /// What was measured; times are means over the timed steps.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Throughput {
-    /// Samples per step.
+    /// Samples per batch.
     pub batch: usize,
+    /// Batches per step.
+    pub accumulate: usize,
     /// Steps timed.
     pub steps: usize,
     /// Samples per second of wall time.
@@ -61,15 +63,16 @@ pub fn throughput(
     let device = device.clone().autodiff();
     let net = super::initial_net(experiment, &device)?;
     let mut state = State::start(experiment, net, &device);
-    let size = experiment.run.batch;
+    let (size, accumulate) = (experiment.run.batch, experiment.run.accumulate);
     let batch = synthetic_batch(&experiment.model_spec()?, size, experiment.sampler.templates);
+    let batches = vec![batch; accumulate];
     let weights = LossWeights { classification: experiment.loss.cls, giou: experiment.loss.reg };
     let backbone = optim::backbone_group().map_err(FitError::Device)?;
     let mut step = || -> Result<StepFigures, FitError> {
-        device.seed(super::mix(experiment.run.seed, state.step));
         let net = optim::learning_rate(&experiment.optim, &backbone, 1.0);
         let rates = Rates { net, align: experiment.align.lr.unwrap_or(experiment.optim.lr_head) };
-        let figures = train_step(&mut state, &batch, experiment, weights, rates, &device)?;
+        let devices = std::slice::from_ref(&device);
+        let figures = train_step(&mut state, &batches, experiment, weights, rates, devices)?;
         state.step += 1;
         Ok(figures)
     };
@@ -91,10 +94,11 @@ pub fn throughput(
     }
     let wall = wall.elapsed();
     let cpu = cpu.zip(cpu_time()).map(|(before, after)| after.saturating_sub(before));
-    let samples = (steps * size) as f64;
+    let samples = (steps * size * accumulate) as f64;
     let milliseconds = |t: Duration, n: f64| t.as_secs_f64() * 1e3 / n;
     Ok(Throughput {
         batch: size,
+        accumulate,
         steps,
         samples_per_s: samples / wall.as_secs_f64(),
         cpu_ms_per_sample: cpu.map(|t| milliseconds(t, samples)),
@@ -107,7 +111,7 @@ pub fn throughput(
 }
 
 /// Pixels from a fixed generator, roughly normal as real crops are; boxes around the middle.
-fn synthetic_batch(spec: &ModelSpec, size: usize, templates: usize) -> Batch {
+pub(super) fn synthetic_batch(spec: &ModelSpec, size: usize, templates: usize) -> Batch {
     let mut seed = 0u64;
     let mut pixels = |count: usize| -> Vec<f32> {
         (0..count)

@@ -7,6 +7,7 @@ mod rearrangements;
 use super::*;
 use crate::import::{self, StateDict, StateTensor};
 use burn::module::{ModuleVisitor, Param};
+use burn::optim::GradientsParams;
 use burn::tensor::Gradients;
 use std::path::Path;
 use tsda_runtime::Backbone;
@@ -317,14 +318,31 @@ fn positional_code_equals_the_reference() {
     assert!(difference(&layers::positional_code(f, d), want) <= 2e-6);
 }
 
+/// What a backward pass left behind, in one of burn's two forms.
+pub(crate) trait GradientsOf {
+    fn of<const D: usize>(&self, param: &Param<Tensor<D>>) -> Option<Tensor<D>>;
+}
+
+impl GradientsOf for Gradients {
+    fn of<const D: usize>(&self, param: &Param<Tensor<D>>) -> Option<Tensor<D>> {
+        param.val().grad(self)
+    }
+}
+
+impl GradientsOf for GradientsParams {
+    fn of<const D: usize>(&self, param: &Param<Tensor<D>>) -> Option<Tensor<D>> {
+        self.get(param.id)
+    }
+}
+
 /// Gradients by state-dict name.
-struct GradientDict<'a> {
+struct GradientDict<'a, G> {
     path: Vec<String>,
-    gradients: &'a Gradients,
+    gradients: &'a G,
     dict: StateDict,
 }
 
-impl ModuleVisitor for GradientDict<'_> {
+impl<G: GradientsOf> ModuleVisitor for GradientDict<'_, G> {
     fn enter_module(&mut self, name: &str, _container: &str) {
         self.path.push(name.into());
     }
@@ -334,7 +352,7 @@ impl ModuleVisitor for GradientDict<'_> {
     }
 
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-        let Some(gradient) = param.val().grad(self.gradients) else { return };
+        let Some(gradient) = self.gradients.of(param) else { return };
         let (name, layout) = state_dict_name(&self.path);
         let shape: Vec<usize> = gradient.dims().to_vec();
         let values = if layout.is_transposed() {
@@ -346,7 +364,7 @@ impl ModuleVisitor for GradientDict<'_> {
     }
 }
 
-pub(crate) fn gradients(net: &TrackerNet, gradients: &Gradients) -> StateDict {
+pub(crate) fn gradients(net: &TrackerNet, gradients: &impl GradientsOf) -> StateDict {
     let mut visitor = GradientDict { path: Vec::new(), gradients, dict: StateDict::default() };
     net.visit(&mut visitor);
     visitor.dict
