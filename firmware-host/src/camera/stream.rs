@@ -4,7 +4,7 @@ use super::format::{Encoding, needed};
 use super::sys::{self, Filled, Queue};
 use crate::host::source::{Captured, Counters};
 use std::io;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tsda_runtime::{FrameView, PixelFormat};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -30,6 +30,8 @@ pub struct Stream {
     shape: Shape,
     what: String,
     held: Option<Filled>,
+    /// When the held picture was taken, where the driver says so on a clock that can be read.
+    taken: Option<Instant>,
     damaged: bool,
     sequence: Option<u32>,
     /// Empty unless pictures are decoded.
@@ -79,6 +81,7 @@ impl Stream {
             shape,
             what,
             held: None,
+            taken: None,
             damaged: false,
             sequence: None,
             decoded,
@@ -102,6 +105,7 @@ impl Stream {
         match self.newest(wait, counters) {
             Ok(Some(filled)) => {
                 self.idle = 0;
+                self.taken = taken(&filled, sys::monotonic(), Instant::now());
                 self.inspect(&filled, counters);
                 counters.delivered += 1;
                 self.held = Some(filled);
@@ -132,6 +136,7 @@ impl Stream {
             self.number(&newer, counters);
             self.queue.give(newest)?;
             counters.skipped += 1;
+            counters.damaged += u64::from(newest.error);
             newest = newer;
         }
         Ok(Some(newest))
@@ -180,11 +185,21 @@ impl Stream {
             full,
             at,
             capture: Some(filled.stamp),
+            taken: self.taken,
             sequence: filled.sequence,
             damaged: self.damaged,
             shutter: false,
         })
     }
+}
+
+/// Pictures are never so old when they are dequeued: such a time stamp is wrong.
+const OLDEST: Duration = Duration::from_secs(10);
+
+/// When a picture was taken; `None` when its time stamp is of another clock or makes no sense.
+fn taken(filled: &Filled, clock: Option<Duration>, now: Instant) -> Option<Instant> {
+    let age = clock.filter(|_| filled.monotonic)?.checked_sub(filled.stamp)?;
+    if age < OLDEST { now.checked_sub(age) } else { None }
 }
 
 /// Decodes a JPEG of exactly this size into `out`; answers whether it could be.
@@ -224,6 +239,32 @@ mod tests {
             .encode(&data, width, height, kind)
             .expect("encodes");
         bytes
+    }
+
+    #[test]
+    fn only_a_plausible_monotonic_time_stamp_says_when_a_picture_was_taken() {
+        let now = Instant::now() + Duration::from_secs(100);
+        let filled = |ms, monotonic| Filled {
+            index: 0,
+            used: 0,
+            error: false,
+            sequence: 0,
+            stamp: Duration::from_millis(ms),
+            monotonic,
+        };
+        let clock = Some(Duration::from_secs(50));
+        for (ms, monotonic, age) in [
+            (49_980, true, Some(20)),
+            (50_000, true, Some(0)),
+            (49_980, false, None),
+            // Later than now (vivid's wrapping time stamps), and long ago.
+            (50_001, true, None),
+            (40_000, true, None),
+        ] {
+            let want = age.map(|a| now - Duration::from_millis(a));
+            assert_eq!(taken(&filled(ms, monotonic), clock, now), want, "{ms} {monotonic}");
+        }
+        assert_eq!(taken(&filled(49_980, true), None, now), None);
     }
 
     #[test]

@@ -29,11 +29,15 @@ fn main() {
         ["set", device, control, value, ..] => Device::open(device)
             .and_then(|d| d.set_ctrl_by_name(control, value.parse().unwrap_or(0)))
             .map_err(Into::into),
+        ["get", device, control, ..] => Device::open(device)
+            .and_then(|d| d.get_ctrl_by_name(control))
+            .map(|value| println!("{value}"))
+            .map_err(Into::into),
         ["feed", device, ..] => feed(device, &args),
         ["usbcam", model, ..] => usb_cam(model, &args),
         _ => {
             eprintln!(
-                "usage: v4l2probe caps DEV | set DEV CONTROL VALUE | feed DEV .. | usbcam MODEL .."
+                "usage: v4l2probe caps DEV | set DEV CONTROL VALUE | get DEV CONTROL | feed DEV .. | usbcam MODEL .."
             );
             std::process::exit(2)
         }
