@@ -2,7 +2,7 @@
 # `tsda run` on real V4L2 drivers without hardware: user-mode Linux (or QEMU) with vivid,
 # v4l2loopback, and a USB thermal camera played to the real uvcvideo.
 #
-#   tests/v4l2/run.sh [--qemu] [--require] [TEST...]      TESTs: vivid faults loopback uvc
+#   tests/v4l2/run.sh [--qemu] [--require] [TEST...]      TESTs: vivid faults loopback uvc pair
 #
 # Without --require it says why and ends with 0 where it cannot run (not root, no packages).
 # TSDA and PROBE may name programs that are already built; TSDA needs the feature `camera`.
@@ -19,7 +19,7 @@ for a; do
     *) tests+=("$a") ;;
   esac
 done
-[ ${#tests[@]} -gt 0 ] || tests=(vivid faults loopback uvc)
+[ ${#tests[@]} -gt 0 ] || tests=(vivid faults loopback uvc pair)
 
 skip() {
   [ -z "$require" ] || { echo "cannot run: $1" >&2; exit 1; }
@@ -52,7 +52,7 @@ for t in "${tests[@]}"; do
   case $t in
     vivid | faults) devices=(--vivid) ;;
     loopback) devices=(--loopback=2) ;;
-    uvc) devices=(--uvc) ;;
+    uvc | pair) devices=(--uvc) ;;
     *) echo "no test $t" >&2; exit 2 ;;
   esac
   echo "== $t"
