@@ -37,7 +37,7 @@ awk -v ha=$held_a -v hb=$held_b '
   /"type":"frame"/ && /"predicted":false/ && /"box"/ {
     match($0, /"sequence":[0-9]+/); s = substr($0, RSTART + 11, RLENGTH - 11) + 0
     match($0, /"source":"[a-z]+/); src = substr($0, RSTART + 10, RLENGTH - 10)
-    match($0, /"box":\[[^\]]*/); split(substr($0, RSTART + 7, RLENGTH - 7), b, ",")
+    match($0, /"box":\[[^]]*/); split(substr($0, RSTART + 7, RLENGTH - 7), b, ",")
     k = s - (src == "rgb" ? ha : hb); if (k < 0) k = 0; if (k > 95) next
     w = (b[1] + b[3] < T[k, 1] + T[k, 3] ? b[1] + b[3] : T[k, 1] + T[k, 3]) - (b[1] > T[k, 1] ? b[1] : T[k, 1])
     h = (b[2] + b[4] < T[k, 2] + T[k, 4] ? b[2] + b[4] : T[k, 2] + T[k, 4]) - (b[2] > T[k, 2] ? b[2] : T[k, 2])

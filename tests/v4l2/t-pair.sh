@@ -56,7 +56,7 @@ awk -v t0=$t0 -v fps=$FPS -v back=$back '
   /"type":"frame"/ && /"predicted":false/ && /"box"/ {
     match($0, /"capture":[0-9.]+/); at = substr($0, RSTART + 10, RLENGTH - 10)
     match($0, /"source":"[a-z]+/); src = substr($0, RSTART + 10, RLENGTH - 10)
-    match($0, /"box":\[[^\]]*/); split(substr($0, RSTART + 7, RLENGTH - 7), b, ",")
+    match($0, /"box":\[[^]]*/); split(substr($0, RSTART + 7, RLENGTH - 7), b, ",")
     k = int((at - t0) * fps); if (k < 0) k = 0; if (k > last) k = last
     w = (b[1] + b[3] < T[k, 1] + T[k, 3] ? b[1] + b[3] : T[k, 1] + T[k, 3]) - (b[1] > T[k, 1] ? b[1] : T[k, 1])
     h = (b[2] + b[4] < T[k, 2] + T[k, 4] ? b[2] + b[4] : T[k, 2] + T[k, 4]) - (b[2] > T[k, 2] ? b[2] : T[k, 2])

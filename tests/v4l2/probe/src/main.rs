@@ -62,7 +62,7 @@ fn feed(path: &str, args: &[String]) -> R<()> {
     let fcc = arg(args, "--fourcc").unwrap_or_else(|| "YUYV".into());
     let (n, fps): (u32, u32) = (num(args, "-n", 100), num(args, "--fps", 30));
     let d = Device::open(path)?;
-    let f = d.set_fmt(BUF_OUTPUT, w, h, fourcc(&fcc))?;
+    let f = d.set_fmt(BUF_OUTPUT, w, h, fourcc(&fcc)).map_err(|e| format!("set the format: {e}"))?;
     if f.pixelformat != fourcc(&fcc) || (f.width, f.height) != (w, h) {
         return Err("the loopback took another format".into());
     }
@@ -87,7 +87,7 @@ fn feed(path: &str, args: &[String]) -> R<()> {
     let mut held = 0;
     if let Some(go) = arg(args, "--go") {
         while !Path::new(&go).exists() {
-            d.write_frame(frames[0])?;
+            d.write_frame(frames[0]).map_err(|e| format!("first write: {e}"))?;
             held += 1;
             std::thread::sleep(pause);
         }
@@ -95,7 +95,7 @@ fn feed(path: &str, args: &[String]) -> R<()> {
     println!("held {held}");
     let t0 = Instant::now();
     for i in 0..n {
-        d.write_frame(frames[i as usize % frames.len()])?;
+        d.write_frame(frames[i as usize % frames.len()]).map_err(|e| format!("write {i}: {e}"))?;
         let due = t0 + pause * (i + 1);
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
     }
