@@ -4,7 +4,9 @@
 #
 #   tests/v4l2/run.sh [--qemu] [--require] [TEST...]      TESTs: vivid faults loopback uvc pair
 #
-# Without --require it says why and ends with 0 where it cannot run (not root, no packages).
+# Without --require it says why and ends with 0 where it cannot run (not root, no packages), and where
+# the kernel is not in the cache yet: building it takes minutes. TSDA_V4L2=1 builds it, TSDA_V4L2=0
+# leaves the tests out.
 # TSDA and PROBE may name programs that are already built; TSDA needs the feature `camera`.
 # QEMU_V4L2_CACHE is where kernels are kept (vm.sh --help).
 set -euo pipefail
@@ -28,8 +30,22 @@ skip() {
 }
 [ "$(uname -s)-$(uname -m)" = Linux-x86_64 ] || skip "the virtual machine is for x86-64 Linux"
 command -v apt-get >/dev/null || skip "kernels come from Debian packages, and there is no apt-get"
-[ "$(id -u)" = 0 ] || [ -e "${QEMU_V4L2_CACHE:-$HOME/.cache/qemu-v4l2-test}/uml/.done" ] ||
-  skip "needs root to install what builds the kernel"
+[ -n "$require" ] || [ "${TSDA_V4L2:-}" != 0 ] || skip "TSDA_V4L2=0"
+cache=${QEMU_V4L2_CACHE:-$HOME/.cache/qemu-v4l2-test}
+kernel=$cache/uml; [ -n "$back" ] || kernel=$cache/kernel
+if [ ! -e "$kernel/.done" ]; then
+  [ -n "$require" ] || [ "${TSDA_V4L2:-}" = 1 ] ||
+    skip "no kernel in $cache yet; TSDA_V4L2=1 builds it once (5 to 30 minutes)"
+  [ "$(id -u)" = 0 ] || skip "needs root to install what builds the kernel"
+fi
+# What reads the kernel's headers when tsda is built with cameras.
+has_clang() {
+  [ -n "${LIBCLANG_PATH:-}${TSDA:-}" ] || ls /usr/lib/llvm-*/lib/libclang*.so* >/dev/null 2>&1 ||
+    ldconfig -p 2>/dev/null | grep -q libclang
+}
+has_clang || { [ "$(id -u)" = 0 ] && { apt-get -qq update && DEBIAN_FRONTEND=noninteractive \
+  apt-get -qq install -y --no-install-recommends libclang1 linux-libc-dev; } >/dev/null 2>&1; } || true
+has_clang || skip "no libclang, which building with cameras needs (apt-get install libclang1)"
 log=$(mktemp -d)
 trap 'rm -rf "$log"' EXIT
 "$here/vm.sh" $back --vivid --loopback=2 --uvc --prepare >"$log/prepare" 2>&1 ||

@@ -2,7 +2,7 @@
 
 use super::format::{self, Encoding, FORMATS};
 use super::stream::{Shape, Stream};
-use super::sys::{EBUSY, ENODEV, ENOENT, ENXIO, Queue};
+use super::sys::{EBUSY, EINVAL, ENODEV, ENOENT, ENXIO, Queue};
 use crate::host::config::V4l2Config;
 use std::io;
 use std::thread;
@@ -26,14 +26,12 @@ pub enum OpenError {
     },
     /// No picture can be had from this node; from a loopback perhaps later, when its writer is there.
     #[error(
-        "{device}: {card} does not capture pictures by streaming (single-planar); another node of \
-         the same camera may (`tsda devices`), and a loopback does when it has a writer (`wait`)"
+        "{device}: no pictures by streaming (single-planar) from here; another node of the same camera \
+         may have them (`tsda devices`), and a loopback has once it has a writer (`wait`)"
     )]
     NoCapture {
         /// The device.
         device: String,
-        /// What it calls itself.
-        card: String,
     },
     /// The device is not what is needed, or does not do what was asked.
     #[error("{device}: {reason}")]
@@ -88,12 +86,18 @@ fn start(config: &V4l2Config, name: &str) -> Result<Stream, OpenError> {
         return Err(unsuited("the name contains a zero byte".into()));
     }
     let device = Device::with_path(&config.device).map_err(system("open"))?;
+    let no_capture = || OpenError::NoCapture { device: name.to_owned() };
+    // Before the capabilities: v4l2loopback 0.12 keeps what it answers there, and a loopback asked after
+    // its writer has gone refuses every later writer.
+    let now = device.format().map_err(|e| match e.raw_os_error() {
+        Some(EINVAL) => no_capture(),
+        _ => system("read the format")(e),
+    })?;
     let caps = device.query_caps().map_err(system("query capabilities"))?;
     if !caps.capabilities.contains(Flags::VIDEO_CAPTURE | Flags::STREAMING) {
-        return Err(OpenError::NoCapture { device: name.to_owned(), card: caps.card });
+        return Err(no_capture());
     }
     let (code, encoding, full) = choose(&device, config, &unsuited)?;
-    let now = device.format().map_err(system("read the format"))?;
     let [width, height] = config.size.unwrap_or([now.width, now.height]);
     let fourcc = FourCC::new(&code_bytes(code));
     let got =

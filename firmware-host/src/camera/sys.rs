@@ -33,6 +33,7 @@ pub(super) const ENXIO: i32 = 6;
 pub(super) const EAGAIN: i32 = 11;
 pub(super) const EBUSY: i32 = 16;
 pub(super) const ENODEV: i32 = 19;
+pub(super) const EINVAL: i32 = 22;
 
 /// A filled buffer. It belongs to the holder until [`Queue::give`].
 #[derive(Clone, Copy, Debug)]
