@@ -38,7 +38,7 @@ pub(super) const EINVAL: i32 = 22;
 /// A filled buffer. It belongs to the holder until [`Queue::give`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Filled {
-    pub index: u32,
+    index: u32,
     /// Bytes the driver wrote.
     pub used: usize,
     /// Whether the driver marked it as damaged.
