@@ -3,7 +3,8 @@ bad=0
 fail() { echo "FAIL: $*"; bad=$((bad + 1)); }
 ok() { echo "ok: $*"; }
 
-# config NAME DEVICE FORMAT WxH [more keys of v4l2]: a configuration with one camera
+# config NAME DEVICE FORMAT WxH [more keys of v4l2]: a configuration with one camera; PATIENT: pictures may
+# take three seconds, for tests that are not about time on a machine that may be busy
 config() {
   profile=
   [ -z "${PROFILE:-}" ] || profile="profile = \"$PROFILE\""
@@ -13,6 +14,7 @@ give_up_s = ${GIVE_UP:-30}
 name = "cam"
 sensor = "${SENSOR:-rgb}"
 $profile
+${PATIENT:+health = { timeout_s = 3 \}}
 v4l2 = { device = "$2", format = "$3", size = [${4%x*}, ${4#*x}]${5:+, $5} }
 [target]
 box = [${BOX:-40, 30, 40, 40}]

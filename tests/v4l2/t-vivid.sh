@@ -6,7 +6,7 @@ grep -q "^$D vivid" /out/devices.txt && grep -q "^  YUYV .*640x" /out/devices.tx
 for f in YUYV UYVY NV12 RGB3 BGR3 GREY Y16 Y10; do
   size=640x480; [ $f != Y10 ] || size=320x180
   sensor=rgb; case $f in Y1*) sensor=thermal ;; esac
-  SENSOR=$sensor config $f $D $f $size "rate = 30.0"
+  PATIENT=y SENSOR=$sensor config $f $D $f $size "rate = 30.0"
   run $f --frames 30; rc=$?
   if [ $rc = 0 ] && [ "$(frames $f)" = 30 ] && [ "$(good $f 0)" = 30 ] && ! has $f '"predicted":true'; then
     ok "$f: $(tail -1 /out/$f.err)"
@@ -43,8 +43,8 @@ config still $D YUYV 640x480 "rate = 30.0"; begin still
 until_true 30 goes_on still 0 10 || fail "no pictures"
 for _ in 1 2 3 4 5 6; do kill -STOP $pid; sleep 1; kill -CONT $pid; sleep 1; done
 end still "standing still"
-late=$(sed -n 's/.*"predicted":false.*"latency_ms":\([0-9.]*\),"track_ms":\([0-9.]*\).*/\1 \2/p' /out/still.jsonl | awk '$1 - $2 > 400 { n++ } $1 > 5000 { wrong++ } END { print n + 0, wrong + 0 }')
-case $late in [3-6]" 0") ok "latency begins at the driver's time stamp" ;; *) fail "latency: late and wrong: $late" ;; esac
+late=$(sed -n 's/.*"predicted":false.*"latency_ms":\([0-9.]*\),"track_ms":\([0-9.]*\).*/\1 \2/p' /out/still.jsonl | awk '$1 - $2 > 400 { n++ } $1 - $2 < 200 { soon++ } $1 > 15000 { wrong++ } END { print (n >= 3 && soon >= 10 && !wrong) ? "ok" : "bad", n + 0, soon + 0, wrong + 0 }')
+case $late in ok*) ok "latency begins at the driver's time stamp: ${late#ok } late, soon, wrong" ;; *) fail "latency: $late" ;; esac
 [ "$(figure still 'passed over')" -ge 4 ] && ok "older pictures are passed over" || fail "passed over: $(tail -2 /out/still.err)"
 no_panic
 exit $bad
