@@ -72,7 +72,7 @@ for t in "${tests[@]}"; do
     *) echo "no test $t" >&2; exit 2 ;;
   esac
   echo "== $t"
-  if "$here/vm.sh" $back "${devices[@]}" --timeout "${LIMIT:-240}" --mem 768 --out "$log/out-$t" \
+  if "$here/vm.sh" $back "${devices[@]}" --timeout "${LIMIT:-600}" --mem 768 --out "$log/out-$t" \
     --add "$PROBE:/bin/probe" --add "$log/clip:/data/clip" --add "$here/lib.sh:/data/lib.sh" \
     --sh "$here/t-$t.sh" "$TSDA"; then
     echo "== $t: ok"
