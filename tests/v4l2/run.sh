@@ -52,12 +52,12 @@ trap 'rm -rf "$log"' EXIT
   skip "no kernel: $(tail -1 "$log/prepare")"
 
 if [ -z "${TSDA:-}" ]; then
-  (cd "$root" && cargo build --workspace --bin tsda --features tsda-host/camera) ||
+  (cd "$root" && cargo build --locked --workspace --bin tsda --features tsda-host/camera) ||
     { echo "tsda does not build with cameras" >&2; exit 1; }
   TSDA=${CARGO_TARGET_DIR:-$root/target}/debug/tsda
 fi
 if [ -z "${PROBE:-}" ]; then
-  (cd "$here/probe" && CARGO_TARGET_DIR=$log/probe cargo build --quiet) ||
+  (cd "$here/probe" && CARGO_TARGET_DIR=$log/probe cargo build --locked --quiet) ||
     { echo "the camera player does not build" >&2; exit 1; }
   PROBE=$log/probe/debug/v4l2probe
 fi

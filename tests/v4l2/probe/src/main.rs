@@ -62,7 +62,8 @@ fn feed(path: &str, args: &[String]) -> R<()> {
     let fcc = arg(args, "--fourcc").unwrap_or_else(|| "YUYV".into());
     let (n, fps): (u32, u32) = (num(args, "-n", 100), num(args, "--fps", 30));
     let d = Device::open(path)?;
-    let f = d.set_fmt(BUF_OUTPUT, w, h, fourcc(&fcc)).map_err(|e| format!("set the format: {e}"))?;
+    let f =
+        d.set_fmt(BUF_OUTPUT, w, h, fourcc(&fcc)).map_err(|e| format!("set the format: {e}"))?;
     if f.pixelformat != fourcc(&fcc) || (f.width, f.height) != (w, h) {
         return Err("the loopback took another format".into());
     }
