@@ -26,12 +26,12 @@ give_up_s = 5
 name = "rgb"
 sensor = "rgb"
 v4l2 = { device = "/dev/v4l/by-id/Colour", format = "YUYV", size = [320, 240] }
-health = { frozen_s = 0 }
+health = { frozen_s = 0, timeout_s = 3 }
 [[source]]
 name = "thermal"
 sensor = "thermal"
 v4l2 = { device = "/dev/v4l/by-id/Thermal", format = "Y16", size = [320, 240] }
-health = { frozen_s = 0 }
+health = { frozen_s = 0, timeout_s = 3 }
 [target]
 box = [$(head -1 /data/clip/truth.txt)]
 [switch.failure]
@@ -41,14 +41,17 @@ to = "stdout"
 queue = 4096
 C
 begin pair; until_true 40 goes_on pair 0 4 || fail "no pictures: $(tail -3 /out/pair.err)"
-t0=$(cut -d' ' -f1 /proc/uptime); touch /tmp/go
-sleep 4; kill -9 $webcam
+from=$(lines pair); t0=$(cut -d' ' -f1 /proc/uptime); touch /tmp/go
+until_true 30 goes_on pair $from 24 || fail "no pictures of the scene: $(tail -3 /out/pair.err)"
+kill -9 $webcam
 until_true 5 has pair '"event":"switched","from":"rgb","to":"thermal","reason":"failure: gone"' && ok "pulled out: changed at once" || fail "no change: $(tail -3 /out/pair.err)"
-sleep 2; colour
+from=$(lines pair); until_true 30 goes_on pair $from 14 || fail "no thermal pictures: $(tail -3 /out/pair.err)"
+colour
 until_true 20 has pair '"event":"switched","from":"thermal","to":"rgb","reason":"recovered"' && ok "put back: used again" || fail "not used again: $(tail -3 /out/pair.err)"
 back=$(lines pair)
 until_true 20 goes_on pair $back 12 || fail "no pictures after the return"
 end pair pair
+[ "$(grep -c '"event":"switched"' /out/pair.jsonl)" = 2 ] && ok "no other change" || fail "changes: $(grep switched /out/pair.err)"
 c=$(figure pair "times unplugged"); [ "$c" = 1 ] && ok "counted" || fail "unplugged: $c times: $(tail -3 /out/pair.err)"
 # mean IoU of the frames that were tracked in, by source and for the time after the return
 awk -v t0=$t0 -v fps=$FPS -v back=$back '
