@@ -11,12 +11,12 @@ give_up_s = 3
 name = "rgb"
 sensor = "rgb"
 v4l2 = { device = "/dev/video20", format = "RGB3", size = [320, 240] }
-health = { frozen_s = 0 }
+health = { frozen_s = 0, timeout_s = 1.5 }
 [[source]]
 name = "thermal"
 sensor = "thermal"
 v4l2 = { device = "/dev/video21", format = "Y16", size = [320, 240] }
-health = { frozen_s = 0 }
+health = { frozen_s = 0, timeout_s = 1.5 }
 [target]
 box = [$box]
 [switch.failure]
