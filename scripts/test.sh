@@ -40,6 +40,11 @@ status=0
 # --show-output: the measured figures (parity, allocations, reference cases) are worth reading.
 cargo test --workspace --locked "$@" -- --show-output 2>&1 | tee "$log" || status=$?
 
+# Cameras on the kernel's own test drivers, in a virtual machine; says why where it cannot run.
+if [ $# = 0 ]; then
+  tests/v4l2/run.sh || status=$?
+fi
+
 # cargo closes with the documentation tests of the last crate; this is the sum over all of them.
 awk '/^test result:/ { passed += $4; failed += $6; ignored += $8 }
      END { printf "%d passed, %d failed, %d skipped\n", passed, failed, ignored }' "$log"

@@ -2,9 +2,11 @@
 # `tsda run` on real V4L2 drivers without hardware: user-mode Linux (or QEMU) with vivid,
 # v4l2loopback, and a USB thermal camera played to the real uvcvideo.
 #
-#   tests/v4l2/run.sh [--qemu] [--require] [TEST...]      TESTs: vivid faults loopback uvc
+#   tests/v4l2/run.sh [--qemu] [--require] [TEST...]      TESTs: vivid faults loopback uvc pair
 #
-# Without --require it says why and ends with 0 where it cannot run (not root, no packages).
+# Without --require it says why and ends with 0 where it cannot run (not root, no packages), and where
+# the kernel is not in the cache yet: building it takes minutes. TSDA_V4L2=1 builds it, TSDA_V4L2=0
+# leaves the tests out.
 # TSDA and PROBE may name programs that are already built; TSDA needs the feature `camera`.
 # QEMU_V4L2_CACHE is where kernels are kept (vm.sh --help).
 set -euo pipefail
@@ -19,7 +21,7 @@ for a; do
     *) tests+=("$a") ;;
   esac
 done
-[ ${#tests[@]} -gt 0 ] || tests=(vivid faults loopback uvc)
+[ ${#tests[@]} -gt 0 ] || tests=(vivid faults loopback uvc pair)
 
 skip() {
   [ -z "$require" ] || { echo "cannot run: $1" >&2; exit 1; }
@@ -28,20 +30,34 @@ skip() {
 }
 [ "$(uname -s)-$(uname -m)" = Linux-x86_64 ] || skip "the virtual machine is for x86-64 Linux"
 command -v apt-get >/dev/null || skip "kernels come from Debian packages, and there is no apt-get"
-[ "$(id -u)" = 0 ] || [ -e "${QEMU_V4L2_CACHE:-$HOME/.cache/qemu-v4l2-test}/uml/.done" ] ||
-  skip "needs root to install what builds the kernel"
+[ -n "$require" ] || [ "${TSDA_V4L2:-}" != 0 ] || skip "TSDA_V4L2=0"
+cache=${QEMU_V4L2_CACHE:-$HOME/.cache/qemu-v4l2-test}
+kernel=$cache/uml; [ -n "$back" ] || kernel=$cache/kernel
+if [ ! -e "$kernel/.done" ]; then
+  [ -n "$require" ] || [ "${TSDA_V4L2:-}" = 1 ] ||
+    skip "no kernel in $cache yet; TSDA_V4L2=1 builds it once (5 to 30 minutes)"
+  [ "$(id -u)" = 0 ] || skip "needs root to install what builds the kernel"
+fi
+# What reads the kernel's headers when tsda is built with cameras.
+has_clang() {
+  [ -n "${LIBCLANG_PATH:-}${TSDA:-}" ] || ls /usr/lib/llvm-*/lib/libclang*.so* >/dev/null 2>&1 ||
+    ldconfig -p 2>/dev/null | grep -q libclang
+}
+has_clang || { [ "$(id -u)" = 0 ] && { apt-get -qq update && DEBIAN_FRONTEND=noninteractive \
+  apt-get -qq install -y --no-install-recommends libclang1 linux-libc-dev; } >/dev/null 2>&1; } || true
+has_clang || skip "no libclang, which building with cameras needs (apt-get install libclang1)"
 log=$(mktemp -d)
 trap 'rm -rf "$log"' EXIT
 "$here/vm.sh" $back --vivid --loopback=2 --uvc --prepare >"$log/prepare" 2>&1 ||
   skip "no kernel: $(tail -1 "$log/prepare")"
 
 if [ -z "${TSDA:-}" ]; then
-  (cd "$root" && cargo build --workspace --bin tsda --features tsda-host/camera) ||
+  (cd "$root" && cargo build --locked --workspace --bin tsda --features tsda-host/camera) ||
     { echo "tsda does not build with cameras" >&2; exit 1; }
   TSDA=${CARGO_TARGET_DIR:-$root/target}/debug/tsda
 fi
 if [ -z "${PROBE:-}" ]; then
-  (cd "$here/probe" && CARGO_TARGET_DIR=$log/probe cargo build --quiet) ||
+  (cd "$here/probe" && CARGO_TARGET_DIR=$log/probe cargo build --locked --quiet) ||
     { echo "the camera player does not build" >&2; exit 1; }
   PROBE=$log/probe/debug/v4l2probe
 fi
@@ -52,11 +68,11 @@ for t in "${tests[@]}"; do
   case $t in
     vivid | faults) devices=(--vivid) ;;
     loopback) devices=(--loopback=2) ;;
-    uvc) devices=(--uvc) ;;
+    uvc | pair) devices=(--uvc) ;;
     *) echo "no test $t" >&2; exit 2 ;;
   esac
   echo "== $t"
-  if "$here/vm.sh" $back "${devices[@]}" --timeout "${LIMIT:-240}" --mem 768 --out "$log/out-$t" \
+  if "$here/vm.sh" $back "${devices[@]}" --timeout "${LIMIT:-600}" --mem 768 --out "$log/out-$t" \
     --add "$PROBE:/bin/probe" --add "$log/clip:/data/clip" --add "$here/lib.sh:/data/lib.sh" \
     --sh "$here/t-$t.sh" "$TSDA"; then
     echo "== $t: ok"

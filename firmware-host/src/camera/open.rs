@@ -2,7 +2,7 @@
 
 use super::format::{self, Encoding, FORMATS};
 use super::stream::{Shape, Stream};
-use super::sys::Queue;
+use super::sys::{EBUSY, EINVAL, ENODEV, ENOENT, ENXIO, Queue};
 use crate::host::config::V4l2Config;
 use std::io;
 use std::thread;
@@ -24,6 +24,15 @@ pub enum OpenError {
         /// What the system said.
         source: io::Error,
     },
+    /// No picture can be had from this node; from a loopback perhaps later, when its writer is there.
+    #[error(
+        "{device}: no pictures by streaming (single-planar) from here; another node of the same camera \
+         may have them (`tsda devices`), and a loopback has once it has a writer (`wait`)"
+    )]
+    NoCapture {
+        /// The device.
+        device: String,
+    },
     /// The device is not what is needed, or does not do what was asked.
     #[error("{device}: {reason}")]
     Unsuited {
@@ -35,11 +44,19 @@ pub enum OpenError {
 }
 
 impl OpenError {
-    /// Whether the device is just not there, or in use: waiting may help.
+    /// Whether the device is not there.
     pub fn is_absent(&self) -> bool {
-        matches!(self, Self::System { source, .. } if matches!(
-            source.raw_os_error(), Some(2 | 6 | super::sys::ENODEV | 16)
-        ))
+        matches!(self, Self::System { source, .. }
+            if matches!(source.raw_os_error(), Some(ENOENT | ENXIO | ENODEV)))
+    }
+
+    /// Whether waiting may help: the device is not there, in use, or without a writer.
+    pub fn may_pass(&self) -> bool {
+        match self {
+            Self::System { source, .. } => self.is_absent() || source.raw_os_error() == Some(EBUSY),
+            Self::NoCapture { .. } => true,
+            Self::Unsuited { .. } => false,
+        }
     }
 }
 
@@ -69,17 +86,18 @@ fn start(config: &V4l2Config, name: &str) -> Result<Stream, OpenError> {
         return Err(unsuited("the name contains a zero byte".into()));
     }
     let device = Device::with_path(&config.device).map_err(system("open"))?;
+    let no_capture = || OpenError::NoCapture { device: name.to_owned() };
+    // Before the capabilities: v4l2loopback 0.12 keeps what it answers there, and a loopback asked after
+    // its writer has gone refuses every later writer.
+    let now = device.format().map_err(|e| match e.raw_os_error() {
+        Some(EINVAL) => no_capture(),
+        _ => system("read the format")(e),
+    })?;
     let caps = device.query_caps().map_err(system("query capabilities"))?;
     if !caps.capabilities.contains(Flags::VIDEO_CAPTURE | Flags::STREAMING) {
-        let reason = format!(
-            "{} does not capture pictures by streaming (single-planar); another node of the same \
-             camera may: `tsda devices`",
-            caps.card
-        );
-        return Err(unsuited(reason));
+        return Err(no_capture());
     }
     let (code, encoding, full) = choose(&device, config, &unsuited)?;
-    let now = device.format().map_err(system("read the format"))?;
     let [width, height] = config.size.unwrap_or([now.width, now.height]);
     let fourcc = FourCC::new(&code_bytes(code));
     let got =
@@ -151,6 +169,15 @@ fn controls(
             let names: Vec<&str> = there.iter().map(|c| c.name.as_str()).collect();
             unsuited(format!("no control `{name}`; there are {}", names.join(", ")))
         })?;
+        // Drivers take what is out of range for the nearest value and say nothing.
+        if control.typ != v4l::control::Type::Button
+            && !(control.minimum..=control.maximum).contains(value)
+        {
+            let (low, high) = (control.minimum, control.maximum);
+            return Err(unsuited(format!(
+                "control `{name}` = {value}: it goes from {low} to {high}"
+            )));
+        }
         device
             .set_control(v4l::Control {
                 id: control.id,

@@ -28,12 +28,24 @@ pub struct CameraSource {
     newest: Instant,
     what: String,
     rate: Option<f64>,
+    trouble: Option<String>,
 }
 
 #[derive(Debug)]
 enum State {
     Running(Box<Stream>),
-    Opening { stream: Receiver<Stream>, stop: Arc<AtomicBool>, gone: bool },
+    Opening { attempts: Receiver<Attempt>, stop: Arc<AtomicBool>, gone: bool },
+}
+
+/// What the thread that opens a device has to say.
+#[derive(Debug)]
+enum Attempt {
+    Opened(Box<Stream>),
+    /// Not yet, and why; said again only when the reason is another.
+    Failed {
+        reason: String,
+        absent: bool,
+    },
 }
 
 impl CameraSource {
@@ -54,7 +66,7 @@ impl CameraSource {
                 rate = stream.shape().rate.or(rate);
                 State::Running(Box::new(stream))
             }
-            Err(e) if config.wait && e.is_absent() => opening(config, true).map_err(refused)?,
+            Err(e) if config.wait && e.may_pass() => opening(config, true).map_err(refused)?,
             Err(e) => return Err(refused(e)),
         };
         Ok(Self {
@@ -65,6 +77,7 @@ impl CameraSource {
             newest: Instant::now(),
             what,
             rate,
+            trouble: None,
         })
     }
 
@@ -76,7 +89,7 @@ impl CameraSource {
         // The old stream has to be closed first: a device streams once.
         let (_, empty) = sync_channel(1);
         let none = Arc::new(AtomicBool::new(true));
-        self.state = State::Opening { stream: empty, stop: none, gone };
+        self.state = State::Opening { attempts: empty, stop: none, gone };
         self.state = opening(&self.config, gone).map_err(refused)?;
         Ok(())
     }
@@ -84,27 +97,38 @@ impl CameraSource {
 
 /// Starts a thread that opens the device as soon as it can be opened.
 fn opening(config: &V4l2Config, gone: bool) -> Result<State, OpenError> {
-    let (found, stream) = sync_channel(1);
+    let (tell, attempts) = sync_channel(1);
     let stop = Arc::new(AtomicBool::new(false));
     let (config, stopped) = (config.clone(), Arc::clone(&stop));
     let device = config.device.display().to_string();
     thread::Builder::new()
         .name("tsda-reopen".into())
         .spawn(move || {
+            let mut told = String::new();
             while !stopped.load(Ordering::Relaxed) {
                 // Whatever is wrong now may be right later: another device may have the name for a
                 // while, or the writer of a loopback may not have set its format yet.
                 match open(&config) {
                     Ok(stream) => {
-                        let _ = found.send(stream);
+                        let _ = tell.send(Attempt::Opened(Box::new(stream)));
                         return;
                     }
-                    Err(_) => thread::sleep(LOOK),
+                    Err(e) => {
+                        let reason = e.to_string();
+                        if told != reason {
+                            told.clone_from(&reason);
+                            let absent = e.is_absent();
+                            if tell.send(Attempt::Failed { reason, absent }).is_err() {
+                                return;
+                            }
+                        }
+                        thread::sleep(LOOK);
+                    }
                 }
             }
         })
         .map_err(|source| OpenError::System { device, what: "start a thread", source })?;
-    Ok(State::Opening { stream, stop, gone })
+    Ok(State::Opening { attempts, stop, gone })
 }
 
 impl Source for CameraSource {
@@ -125,20 +149,28 @@ impl Source for CameraSource {
                     self.reopen(true)?;
                 }
             },
-            State::Opening { stream, gone, .. } => {
-                let gone = *gone;
-                match stream.recv_timeout(wait) {
-                    Ok(stream) => {
+            State::Opening { attempts, gone, .. } => {
+                let was_gone = *gone;
+                match attempts.recv_timeout(wait) {
+                    Ok(Attempt::Opened(stream)) => {
                         stream.describe().clone_into(&mut self.what);
                         self.newest = Instant::now();
-                        self.state = State::Running(Box::new(stream));
+                        self.state = State::Running(stream);
                         return Ok(Polled::Nothing);
+                    }
+                    Ok(Attempt::Failed { reason, absent }) => {
+                        // Pulled out while its stream was being restarted.
+                        if absent && !was_gone {
+                            *gone = true;
+                            self.counters.unplugged += 1;
+                        }
+                        self.trouble = Some(reason);
                     }
                     Err(RecvTimeoutError::Timeout) => {}
                     // The thread ended without a stream; it did not live long enough to wait.
                     Err(RecvTimeoutError::Disconnected) => {
                         clock.sleep(wait.min(LOOK));
-                        self.reopen(gone)?;
+                        self.reopen(was_gone)?;
                     }
                 }
             }
@@ -152,6 +184,10 @@ impl Source for CameraSource {
             State::Running(stream) => stream.frame(self.at),
             State::Opening { .. } => None,
         }
+    }
+
+    fn trouble(&mut self) -> Option<String> {
+        self.trouble.take()
     }
 
     fn counters(&self) -> Counters {

@@ -4,7 +4,7 @@ use super::format::{Encoding, needed};
 use super::sys::{self, Filled, Queue};
 use crate::host::source::{Captured, Counters};
 use std::io;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tsda_runtime::{FrameView, PixelFormat};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -30,6 +30,8 @@ pub struct Stream {
     shape: Shape,
     what: String,
     held: Option<Filled>,
+    /// When the held picture was taken, where the driver says so on a clock that can be read.
+    taken: Option<Instant>,
     damaged: bool,
     sequence: Option<u32>,
     /// Empty unless pictures are decoded.
@@ -79,6 +81,7 @@ impl Stream {
             shape,
             what,
             held: None,
+            taken: None,
             damaged: false,
             sequence: None,
             decoded,
@@ -102,6 +105,8 @@ impl Stream {
         match self.newest(wait, counters) {
             Ok(Some(filled)) => {
                 self.idle = 0;
+                let clock = sys::monotonic().filter(|_| filled.monotonic);
+                self.taken = taken(filled.stamp, clock, Instant::now());
                 self.inspect(&filled, counters);
                 counters.delivered += 1;
                 self.held = Some(filled);
@@ -132,6 +137,7 @@ impl Stream {
             self.number(&newer, counters);
             self.queue.give(newest)?;
             counters.skipped += 1;
+            counters.damaged += u64::from(newest.error);
             newest = newer;
         }
         Ok(Some(newest))
@@ -180,11 +186,22 @@ impl Stream {
             full,
             at,
             capture: Some(filled.stamp),
+            taken: self.taken,
             sequence: filled.sequence,
             damaged: self.damaged,
             shutter: false,
         })
     }
+}
+
+/// Pictures are never so old when they are dequeued: such a time stamp is wrong.
+const OLDEST: Duration = Duration::from_secs(10);
+
+/// When a picture with this time stamp was taken, `clock` being the same clock now; `None` when that
+/// cannot be read or the time stamp makes no sense.
+fn taken(stamp: Duration, clock: Option<Duration>, now: Instant) -> Option<Instant> {
+    let age = clock?.checked_sub(stamp)?;
+    if age < OLDEST { now.checked_sub(age) } else { None }
 }
 
 /// Decodes a JPEG of exactly this size into `out`; answers whether it could be.
@@ -224,6 +241,23 @@ mod tests {
             .encode(&data, width, height, kind)
             .expect("encodes");
         bytes
+    }
+
+    #[test]
+    fn only_a_plausible_time_stamp_says_when_a_picture_was_taken() {
+        let now = Instant::now() + Duration::from_secs(100);
+        let clock = Some(Duration::from_secs(50));
+        for (ms, age) in [
+            (49_980, Some(20)),
+            (50_000, Some(0)),
+            // Later than now (vivid's wrapping time stamps), and long ago.
+            (50_001, None),
+            (40_000, None),
+        ] {
+            let want = age.map(|a| now - Duration::from_millis(a));
+            assert_eq!(taken(Duration::from_millis(ms), clock, now), want, "{ms}");
+        }
+        assert_eq!(taken(Duration::from_secs(49), None, now), None);
     }
 
     #[test]

@@ -19,14 +19,21 @@ use v4l::v4l2::{self, vidioc};
 const CAPTURE: u32 = 1;
 const MMAP: u32 = 1;
 const FLAG_ERROR: u32 = 0x40;
+/// Which clock a time stamp is of, and the value for `CLOCK_MONOTONIC`.
+const FLAG_CLOCK: u32 = 0xe000;
+const FLAG_CLOCK_MONOTONIC: u32 = 0x2000;
 /// `POLLIN`.
 const READABLE: i16 = 1;
 // The same on every Linux.
 const PROT_READ_WRITE: i32 = 3;
 const MAP_SHARED: i32 = 1;
+pub(super) const ENOENT: i32 = 2;
 pub(super) const EIO: i32 = 5;
+pub(super) const ENXIO: i32 = 6;
 pub(super) const EAGAIN: i32 = 11;
+pub(super) const EBUSY: i32 = 16;
 pub(super) const ENODEV: i32 = 19;
+pub(super) const EINVAL: i32 = 22;
 
 /// A filled buffer. It belongs to the holder until [`Queue::give`].
 #[derive(Clone, Copy, Debug)]
@@ -40,6 +47,8 @@ pub(super) struct Filled {
     pub sequence: u32,
     /// Time stamp on the driver's clock.
     pub stamp: Duration,
+    /// Whether that clock is `CLOCK_MONOTONIC`, which [`monotonic`] reads.
+    pub monotonic: bool,
 }
 
 struct Mapping {
@@ -75,6 +84,16 @@ fn request<T>(device: &Handle, number: vidioc::_IOC_TYPE, argument: &mut T) -> i
             done => return done,
         }
     }
+}
+
+/// `CLOCK_MONOTONIC` now: the clock of most drivers' time stamps, and of [`std::time::Instant`].
+pub(super) fn monotonic() -> Option<Duration> {
+    let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: the structure is alive and writable during the call.
+    if unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &raw mut now) } != 0 {
+        return None;
+    }
+    Some(Duration::new(u64::try_from(now.tv_sec).ok()?, u32::try_from(now.tv_nsec).ok()?))
 }
 
 fn descriptor(index: u32) -> v4l2_buffer {
@@ -166,6 +185,7 @@ impl Queue {
             error: buffer.flags & FLAG_ERROR != 0,
             sequence: buffer.sequence,
             stamp: Duration::new(seconds, micros * 1000),
+            monotonic: buffer.flags & FLAG_CLOCK == FLAG_CLOCK_MONOTONIC,
         }))
     }
 

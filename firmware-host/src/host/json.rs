@@ -314,6 +314,12 @@ impl<'a> JsonEvent<'a> {
             EventKind::Back { source } => {
                 Self { event: "camera_back", source: name(*source), ..base }
             }
+            EventKind::Unavailable { source, reason } => Self {
+                event: "camera_unavailable",
+                source: name(*source),
+                reason: Some(reason.clone()),
+                ..base
+            },
             EventKind::Throttled { on, celsius } => Self {
                 event: if *on { "throttled" } else { "unthrottled" },
                 reason: Some(format!("{celsius:.1} degrees Celsius")),

@@ -58,7 +58,8 @@ pub struct FrameRecord {
     pub condition: Condition,
     /// The target; `None` while there is none.
     pub target: Option<TargetRecord>,
-    /// From the picture being there to its record.
+    /// To this record, from when the picture was taken where the driver tells it on the machine's
+    /// monotonic clock, else from when it was found; while predicted, from the begin of this turn.
     pub latency: Duration,
     /// Part of it inside the tracker.
     pub tracking: Duration,
@@ -112,6 +113,13 @@ pub enum EventKind {
     Back {
         /// Which.
         source: usize,
+    },
+    /// A camera that was lost cannot be opened again for now; it is tried on.
+    Unavailable {
+        /// Which.
+        source: usize,
+        /// What the driver or the system says.
+        reason: String,
     },
     /// The machine is too warm, frames are left out; or no longer.
     Throttled {

@@ -237,13 +237,17 @@ impl<E: Engine> Host<E> {
         }
         let mut fresh = 0u64;
         // The others first: what the active one waits for is used at once.
-        for i in (0..self.sensors.len()).filter(|i| *i != self.active).chain([self.active]) {
-            let wait = if i == self.active { WAIT } else { Duration::ZERO };
+        let active = self.active;
+        for i in (0..self.sensors.len()).filter(|i| *i != active).chain([active]) {
+            let wait = if i == active { WAIT } else { Duration::ZERO };
             match self.sensors[i].poll(&self.clock, wait)? {
                 News::Fresh => fresh |= 1 << i,
                 News::Nothing => {}
-                News::Ended if i == self.active => return Ok(Some(Ending::Source)),
+                News::Ended if i == active => return Ok(Some(Ending::Source)),
                 News::Ended => {}
+            }
+            if let Some(reason) = self.sensors[i].trouble() {
+                self.event(EventKind::Unavailable { source: i, reason });
             }
         }
         let (arrived, now) = (Instant::now(), self.clock.now());
@@ -393,6 +397,7 @@ impl<E: Engine> Host<E> {
         self.skipped = counters.skipped;
         let sensor = &self.sensors[active];
         let captured = sensor.captured();
+        let taken = captured.and_then(|c| c.taken).filter(|_| usable);
         let size = sensor.view().map(|v| (v.width(), v.height()));
         self.sizes[active] = size.or(self.sizes[active]);
         let record = FrameRecord {
@@ -404,7 +409,7 @@ impl<E: Engine> Host<E> {
             sequence: captured.map_or(0, |c| c.sequence),
             condition,
             target: self.target,
-            latency: arrived.elapsed(),
+            latency: taken.map_or(arrived, |t| t.min(arrived)).elapsed(),
             tracking,
             skipped: skipped.min(u64::from(u32::MAX)) as u32,
         };

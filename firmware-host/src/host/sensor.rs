@@ -115,6 +115,11 @@ impl Sensor {
         }
     }
 
+    /// What keeps the device from being opened again, once per reason.
+    pub fn trouble(&mut self) -> Option<String> {
+        self.source.trouble()
+    }
+
     /// Health, layout and gain of a new picture; answers whether it shows anything new.
     fn take(&mut self, now: Duration) -> Result<bool, HostError> {
         let fail = |name: &str, reason: String| HostError::Argument {

@@ -11,7 +11,7 @@ pub use reel::{Fault, FaultKind, Reel};
 use super::Clock;
 use crate::error::HostError;
 use std::fmt::Debug;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tsda_runtime::{BBox, FrameView};
 
 /// What [`Source::poll`] found.
@@ -38,6 +38,8 @@ pub struct Captured<'a> {
     pub at: Duration,
     /// The driver's time stamp.
     pub capture: Option<Duration>,
+    /// The same as a moment of this program, where the driver's clock is the machine's.
+    pub taken: Option<Instant>,
     /// The driver's frame number.
     pub sequence: u32,
     /// Marked by the driver, or shorter than it should be.
@@ -74,6 +76,12 @@ pub trait Source: Debug {
 
     /// The newest picture, until the next [`Self::poll`].
     fn frame(&self) -> Option<Captured<'_>>;
+
+    /// What keeps the device from being opened again; every reason once, as long as it stays the
+    /// same.
+    fn trouble(&mut self) -> Option<String> {
+        None
+    }
 
     /// Counts so far.
     fn counters(&self) -> Counters;

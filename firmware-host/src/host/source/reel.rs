@@ -243,6 +243,7 @@ impl Source for Reel {
             full: self.full,
             at: self.at,
             capture: None,
+            taken: None,
             sequence: (self.next.saturating_sub(1) & u64::from(u32::MAX)) as u32,
             damaged: self.blanked == Some(FaultKind::Damage),
             shutter: self.blanked == Some(FaultKind::Shutter),

@@ -29,11 +29,15 @@ fn main() {
         ["set", device, control, value, ..] => Device::open(device)
             .and_then(|d| d.set_ctrl_by_name(control, value.parse().unwrap_or(0)))
             .map_err(Into::into),
+        ["get", device, control, ..] => Device::open(device)
+            .and_then(|d| d.get_ctrl_by_name(control))
+            .map(|value| println!("{value}"))
+            .map_err(Into::into),
         ["feed", device, ..] => feed(device, &args),
         ["usbcam", model, ..] => usb_cam(model, &args),
         _ => {
             eprintln!(
-                "usage: v4l2probe caps DEV | set DEV CONTROL VALUE | feed DEV .. | usbcam MODEL .."
+                "usage: v4l2probe caps DEV | set DEV CONTROL VALUE | get DEV CONTROL | feed DEV .. | usbcam MODEL .."
             );
             std::process::exit(2)
         }
@@ -58,7 +62,8 @@ fn feed(path: &str, args: &[String]) -> R<()> {
     let fcc = arg(args, "--fourcc").unwrap_or_else(|| "YUYV".into());
     let (n, fps): (u32, u32) = (num(args, "-n", 100), num(args, "--fps", 30));
     let d = Device::open(path)?;
-    let f = d.set_fmt(BUF_OUTPUT, w, h, fourcc(&fcc))?;
+    let f =
+        d.set_fmt(BUF_OUTPUT, w, h, fourcc(&fcc)).map_err(|e| format!("set the format: {e}"))?;
     if f.pixelformat != fourcc(&fcc) || (f.width, f.height) != (w, h) {
         return Err("the loopback took another format".into());
     }
@@ -83,7 +88,7 @@ fn feed(path: &str, args: &[String]) -> R<()> {
     let mut held = 0;
     if let Some(go) = arg(args, "--go") {
         while !Path::new(&go).exists() {
-            d.write_frame(frames[0])?;
+            d.write_frame(frames[0]).map_err(|e| format!("first write: {e}"))?;
             held += 1;
             std::thread::sleep(pause);
         }
@@ -91,7 +96,7 @@ fn feed(path: &str, args: &[String]) -> R<()> {
     println!("held {held}");
     let t0 = Instant::now();
     for i in 0..n {
-        d.write_frame(frames[i as usize % frames.len()])?;
+        d.write_frame(frames[i as usize % frames.len()]).map_err(|e| format!("write {i}: {e}"))?;
         let due = t0 + pause * (i + 1);
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
     }
@@ -127,6 +132,57 @@ fn paint(buf: &mut [u8], fcc: &str, n: u32, w: u32, h: u32) {
     buf[end - 4..end].copy_from_slice(&n.to_le_bytes());
 }
 
+/// What a Lepton says under its picture: status (flat field correction in bits 4 and 5) in words 3
+/// and 4, frame counter in words 20 and 21, low words first.
+fn telemetry(rows: &mut [u8], n: u32, ffc: u32) {
+    let mut long = |word: usize, value: u32| {
+        rows[2 * word..2 * word + 4].copy_from_slice(&value.to_le_bytes());
+    };
+    long(3, ffc << 4);
+    long(20, n);
+}
+
+/// Raw frames of a file that go by time from the moment `go` was made (the first one before), so that
+/// cameras that play the same scene agree, also one that was plugged in again.
+struct Reel {
+    data: Vec<u8>,
+    frame: usize,
+    go: String,
+    fps: f64,
+}
+
+impl Reel {
+    fn open(args: &[String], frame: usize, fps: u32) -> R<Option<Self>> {
+        let Some(file) = arg(args, "--file") else { return Ok(None) };
+        let data = std::fs::read(file)?;
+        if frame == 0 || data.len() < frame {
+            return Err("the file holds no frame".into());
+        }
+        let go = arg(args, "--go").ok_or("--go is missing")?;
+        Ok(Some(Self { data, frame, go, fps: f64::from(fps) }))
+    }
+
+    fn now(&self) -> &[u8] {
+        let since = std::fs::metadata(&self.go).and_then(|m| m.modified()).ok();
+        let time = since.and_then(|t| t.elapsed().ok()).unwrap_or_default();
+        let last = self.data.len() / self.frame - 1;
+        let i = ((time.as_secs_f64() * self.fps) as usize).min(last);
+        &self.data[i * self.frame..][..self.frame]
+    }
+}
+
+/// R, G, B to YUYV, BT.601 limited range.
+fn to_yuyv(rgb: &[u8], out: &mut [u8]) {
+    for (from, to) in rgb.chunks_exact(6).zip(out.chunks_exact_mut(4)) {
+        let at = |i: usize| f32::from(from[i]);
+        let y = |i| 16.0 + 0.257 * at(i) + 0.504 * at(i + 1) + 0.098 * at(i + 2);
+        let [r, g, b] = [0, 1, 2].map(|i| (at(i) + at(i + 3)) / 2.0);
+        let u = 128.0 - 0.148 * r - 0.291 * g + 0.439 * b;
+        let v = 128.0 + 0.439 * r - 0.368 * g - 0.071 * b;
+        to.copy_from_slice(&[y(0), u, y(3), v].map(|x| (x + 0.5) as u8));
+    }
+}
+
 /// Plays a USB camera: `usbcam MODEL [--fps N] [--frames N] [--unplug-at N --replug-ms N] ...`
 fn usb_cam(model: &str, args: &[String]) -> R<()> {
     let m = usbcam::MODELS.iter().find(|m| m.name == model).ok_or("no such model")?;
@@ -137,19 +193,38 @@ fn usb_cam(model: &str, args: &[String]) -> R<()> {
         stall_ms: num(args, "--stall-ms", 3000),
         unplug_at: num(args, "--unplug-at", 0),
     };
+    let (ffc_every, ffc_frames): (u32, u32) =
+        (num(args, "--ffc-every", 0), num(args, "--ffc-frames", 4));
     let mut left: u32 = num(args, "--plugs", if plan.unplug_at > 0 { 2 } else { 1 });
     while left > 0 {
         left -= 1;
-        let c = usbcam::plug(m, num(args, "--fps", 9))?;
+        let fps = num(args, "--fps", 9);
+        let bytes = 320 * 240 * if model == "webcam" { 3 } else { 2 };
+        let reel = Reel::open(args, bytes, fps)?;
+        let c = usbcam::plug(m, fps)?;
         let mut p = plan.clone();
         if left == 0 {
             p.unplug_at = 0;
         }
         let n = c.run(num(args, "--frames", 100_000), &p, |b, n, w, h| {
             let (w, h) = (w as u32, h as u32);
+            if let Some(reel) = &reel {
+                return match model {
+                    "webcam" => to_yuyv(reel.now(), b),
+                    _ => b.copy_from_slice(reel.now()),
+                };
+            }
             match (model, w, h) {
-                // two telemetry rows under the picture
-                ("purethermal", 160, 122) => paint(&mut b[..38400], "Y16 ", n, w, 120),
+                // two telemetry rows under the picture; the shutter closes now and then
+                ("purethermal", 160, 122) => {
+                    let ffc = ffc_every > 0 && n % ffc_every >= ffc_every - ffc_frames;
+                    if ffc {
+                        b[..38400].fill(0x72);
+                    } else {
+                        paint(&mut b[..38400], "Y16 ", n, w, 120);
+                    }
+                    telemetry(&mut b[38400..], n, if ffc { 2 } else { 3 });
+                }
                 ("boson", _, 514) => paint(&mut b[..640 * 512 * 2], "Y16 ", n, w, 512),
                 // picture above, temperatures below
                 ("p2pro", _, 384) => {

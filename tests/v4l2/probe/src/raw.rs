@@ -154,11 +154,20 @@ impl Device {
         let mut c = Control { id, value };
         xioctl(self.fd(), iowr::<Control>(28), &mut c)
     }
-    pub fn set_ctrl_by_name(&self, name: &str, value: i32) -> io::Result<()> {
-        let q = self.ctrls().into_iter().find(|q| cstr(&q.name) == name).ok_or_else(|| {
+    fn named(&self, name: &str) -> io::Result<QueryCtrl> {
+        self.ctrls().into_iter().find(|q| cstr(&q.name) == name).ok_or_else(|| {
             io::Error::new(io::ErrorKind::NotFound, format!("no control named {name}"))
-        })?;
+        })
+    }
+    pub fn set_ctrl_by_name(&self, name: &str, value: i32) -> io::Result<()> {
+        let q = self.named(name)?;
         self.set_ctrl(q.id, value)
+    }
+    pub fn get_ctrl_by_name(&self, name: &str) -> io::Result<i32> {
+        let q = self.named(name)?;
+        let mut c = Control { id: q.id, value: 0 };
+        xioctl(self.fd(), iowr::<Control>(27), &mut c)?;
+        Ok(c.value)
     }
     /// write() I/O, used to feed v4l2loopback.
     pub fn write_frame(&self, b: &[u8]) -> io::Result<usize> {

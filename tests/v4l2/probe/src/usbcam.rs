@@ -36,6 +36,25 @@ pub const MODELS: &[Model] = &[
             Format { fourcc: *b"Y8  ", bpp: 8, sizes: &[(160, 120)] },
         ],
     },
+    // Play files: a colour camera and a thermal one of the same scene.
+    Model {
+        name: "webcam",
+        vid: 0x1d6b,
+        pid: 0x0102,
+        maker: "Test",
+        product: "Colour camera",
+        serial: "1",
+        formats: &[Format { fourcc: *b"YUY2", bpp: 16, sizes: &[(320, 240)] }],
+    },
+    Model {
+        name: "thermal",
+        vid: 0x1d6b,
+        pid: 0x0103,
+        maker: "Test",
+        product: "Thermal camera",
+        serial: "2",
+        formats: &[Format { fourcc: *b"Y16 ", bpp: 16, sizes: &[(320, 240)] }],
+    },
     Model {
         name: "boson",
         vid: 0x09cb,
