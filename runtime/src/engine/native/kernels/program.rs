@@ -416,7 +416,7 @@ impl Step {
                 Self::Quantise(s) => (k.eight.quantise)(s, mem, part),
                 Self::Depthwise(s) => (k.depthwise)(s, mem, part),
                 Self::Pool(s) => (k.pool)(s, mem, part),
-                Self::Copy(s) => s.run(mem, part),
+                Self::Copy(s) => (k.copy)(s, mem, part),
                 Self::Map(s) => (k.map)(s, mem, part),
                 Self::Zip(s) => (k.zip)(s, mem, part),
                 Self::Fold(s) => (k.fold)(s, mem, part),
