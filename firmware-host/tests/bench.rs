@@ -77,11 +77,33 @@ fn every_engine_gets_its_figures_or_a_reason() {
 }
 
 #[test]
+fn every_step_of_the_native_engine_has_its_time() {
+    let output = bench(&["--nodes", "2", "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let json: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(json["preset"], "nano");
+    let steps = json["steps"].as_array().expect("steps");
+    for (graph, kind) in [
+        ("features.onnx", "depthwise"),
+        ("template.onnx", "linear"),
+        ("predict2.onnx", "attention"),
+    ] {
+        let found = steps.iter().find(|s| s["graph"] == graph && s["kind"] == kind);
+        let step = found.unwrap_or_else(|| panic!("{kind} in {graph}: {json}"));
+        assert!(step["wall_us"].as_f64().is_some_and(|us| us > 0.0), "{step}");
+        assert!(step["node"].as_str().is_some_and(|node| !node.is_empty()), "{step}");
+    }
+    let table = bench(&["--nodes", "1"]);
+    assert!(String::from_utf8_lossy(&table.stdout).contains("predict2.onnx"));
+}
+
+#[test]
 fn bad_bundles_and_arguments_end_with_one_message() {
     for (args, code, word) in [
         (&["--bundle", "absent.tsda"][..], 2, "absent.tsda"),
         (&["--frames", "0"], 2, "--frames"),
         (&["--engine", "abacus"], 2, "abacus"),
+        (&["--nodes", "--engine", "native", "--engine", "native"], 2, "--nodes"),
     ] {
         let output = bench(args);
         let message = String::from_utf8_lossy(&output.stderr).into_owned();

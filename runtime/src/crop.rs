@@ -334,27 +334,45 @@ fn resample<const C: usize>(
     let (side, step, full) = (window.output(), window.decimation, window.side as f32);
     let (ratio_y, ratio_x) = (window.y.len as f32 / full, window.x.len as f32 / full);
     let plane = side * side;
-    for r in 0..side {
-        let v = window.y.tap(r + window.margin, ratio_y, step);
-        for c in 0..side {
-            let h = window.x.tap(c + window.margin, ratio_x, step);
-            let corners = [
-                fetch(v.near, h.near),
-                fetch(v.near, h.far),
-                fetch(v.far, h.near),
-                fetch(v.far, h.far),
-            ];
+    // Stripes: where a column reads is found once, and all of a stripe's numbers are at hand when
+    // they are normalised, several at a time.
+    let mut taps = [Tap { near: 0, far: 0, weight: 0.0 }; STRIPE];
+    for left in (0..side).step_by(STRIPE) {
+        let taps = &mut taps[..STRIPE.min(side - left)];
+        for (c, tap) in taps.iter_mut().enumerate() {
+            *tap = window.x.tap(left + c + window.margin, ratio_x, step);
+        }
+        for r in 0..side {
+            let v = window.y.tap(r + window.margin, ratio_y, step);
+            let mut values = [[0.0f32; STRIPE]; C];
+            for (c, h) in taps.iter().enumerate() {
+                let corners = [
+                    fetch(v.near, h.near),
+                    fetch(v.near, h.far),
+                    fetch(v.far, h.near),
+                    fetch(v.far, h.far),
+                ];
+                for (channel, values) in values.iter_mut().enumerate() {
+                    let [a, b, d, e] = corners.map(|p| p[channel]);
+                    let above = (1.0 - h.weight) * a + h.weight * b;
+                    let below = (1.0 - h.weight) * d + h.weight * e;
+                    values[c] = (1.0 - v.weight) * above + v.weight * below;
+                }
+            }
             for channel in 0..3 {
+                let at = channel * plane + r * side + left;
                 // One channel stands for all three.
-                let [a, b, d, e] = corners.map(|p| p[channel.min(C - 1)]);
-                let above = (1.0 - h.weight) * a + h.weight * b;
-                let below = (1.0 - h.weight) * d + h.weight * e;
-                let value = (1.0 - v.weight) * above + v.weight * below;
-                out[channel * plane + r * side + c] = norm(channel, value);
+                let values = &values[channel.min(C - 1)];
+                for (out, &value) in out[at..at + taps.len()].iter_mut().zip(values) {
+                    *out = norm(channel, value);
+                }
             }
         }
     }
 }
+
+/// Columns that are sampled at a time.
+const STRIPE: usize = 64;
 
 #[cfg(test)]
 mod tests;

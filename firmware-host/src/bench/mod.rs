@@ -2,9 +2,11 @@
 //!
 //! Every engine runs in a process of its own ([`worker`]), so that memory and load are its own; the
 //! parent ([`run`]) lets them take turns round by round, so that whatever else the machine does hits
-//! all of them alike. [`report`] has the figures, [`crops`] the crop sampler by itself.
+//! all of them alike. [`report`] has the figures, [`crops`] the crop sampler by itself,
+//! [`nodes`] the steps of the native engine.
 
 pub mod crops;
+pub mod nodes;
 pub mod report;
 pub mod run;
 pub mod worker;

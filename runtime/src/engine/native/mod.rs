@@ -20,8 +20,9 @@ use crate::bundle::{Bundle, SectionKind};
 use crate::spec::ModelSpec;
 use graph::Graph;
 use kernels::Team;
-use plan::{Base, Binding, Plan, Planner, View};
+use plan::{Base, Binding, Plan, Planner, StepLabel, View};
 use std::ops::Range;
+use std::time::Duration;
 
 pub use kernels::Isa;
 pub use plan::ProgramSummary;
@@ -110,6 +111,24 @@ pub struct NativeEngine {
     /// Which template slots have been written.
     filled: Vec<bool>,
     summary: PlanSummary,
+    /// One per step of every program.
+    labels: Vec<Box<[StepLabel]>>,
+}
+
+/// What one step of a graph takes; see [`NativeEngine::step_times`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct StepTime {
+    /// Graph, as the bundle names it.
+    pub graph: String,
+    /// Kind of kernel.
+    pub kind: &'static str,
+    /// Node of the graph; a node can be several steps, and a step several nodes under the name of
+    /// the first one.
+    pub node: String,
+    /// Floating-point operations, about.
+    pub operations: usize,
+    /// The shortest of all runs, by the clock, on one thread.
+    pub time: Duration,
 }
 
 /// Where inputs and results are in the arena.
@@ -168,7 +187,7 @@ impl NativeEngine {
         let places = Self::lower(&mut planner, &spec, &graphs)?;
         let plan = planner.finish().map_err(|e| error(Stage::Load, format_args!("{e}")))?;
         drop(graphs);
-        let Plan { programs, mut summaries, weights, arena, lasting } = plan;
+        let Plan { programs, labels, mut summaries, weights, arena, lasting } = plan;
         summaries.retain(|s| s.steps > 0);
         let summary = PlanSummary {
             isa: isa.name(),
@@ -190,12 +209,42 @@ impl NativeEngine {
             has_feature: false,
             filled: vec![false; spec.templates.into()],
             summary,
+            labels,
         })
     }
 
     /// Sizes and contents of the plan, for `tsda info`.
     pub const fn plan_summary(&self) -> &PlanSummary {
         &self.summary
+    }
+
+    /// Runs the graphs of a frame with all template slots `runs` times on the calling thread and
+    /// notes what every step takes, in the order they run. The results of the engine are what these
+    /// runs leave; slots that were never written hold zeros. Allocates.
+    pub fn step_times(&mut self, runs: usize) -> Vec<StepTime> {
+        let slots = self.filled.len();
+        let predict = self.programs.predict + slots - 1;
+        let kinds = [
+            (self.programs.features, SectionKind::FeaturesOnnx),
+            (self.programs.template, SectionKind::TemplateOnnx),
+            (predict, SectionKind::PredictOnnx(slots as u8)),
+        ];
+        let mut all = Vec::new();
+        for (program, kind) in kinds {
+            let labels = &self.labels[program];
+            let mut shortest = vec![Duration::MAX; labels.len()];
+            for _ in 0..runs.max(1) {
+                self.team.time(program, &mut shortest);
+            }
+            all.extend(labels.iter().zip(shortest).map(|(label, time)| StepTime {
+                graph: kind.to_string(),
+                kind: label.kind,
+                node: label.node.to_string(),
+                operations: label.operations,
+                time,
+            }));
+        }
+        all
     }
 
     fn lower(

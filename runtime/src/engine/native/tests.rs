@@ -383,6 +383,24 @@ fn hard_swish_in_all_its_forms() {
             assert!((y - want).abs() <= 1e-6, "case {i}, element {j}: {y}, not {want}");
         }
     }
+    // Behind a product it is part of the product.
+    let weight: Vec<f32> = (0..9).map(|i| 0.25 * i as f32 - 1.0).collect();
+    let constants = vec![floats("w", &[3, 3, 1, 1], &weight)];
+    let io = |name| vec![port(name, &[1, 3, 2, 4])];
+    let nodes = vec![
+        node("Conv", &["x", "w"], "c", vec![]),
+        node("HardSigmoid", &["c"], "h", sixth()),
+        node("Mul", &["c", "h"], "y", vec![]),
+    ];
+    let bytes = model(nodes, io("x"), io("y"), constants);
+    let mut graph = graph::read(&bytes, &[]).unwrap();
+    graph::fuse(&mut graph);
+    assert_eq!(graph.nodes.len(), 1, "after a convolution");
+    let found = evaluate(&bytes, (&[1, 3, 2, 4], &x), &[1, 3, 2, 4]);
+    for (j, y) in found.iter().enumerate() {
+        let sum: f32 = (0..3).map(|c| weight[j / 8 * 3 + c] * x[c * 8 + j % 8]).sum();
+        assert!((y - swish(sum)).abs() <= 1e-5, "after a convolution, {j}: {y}");
+    }
     // Another slope is another function, and a product that is used twice stays.
     let other = file(vec![
         node("HardSigmoid", &["x"], "h", vec![float("alpha", 0.2)]),

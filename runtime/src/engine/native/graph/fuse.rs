@@ -1,5 +1,6 @@
 //! Groups of operators that are cheaper as one: attention, normalisation of a whole map,
-//! hard-swish, and what follows a product (bias, residual, limits). Whatever does not match stays as it is.
+//! hard-swish, and what follows a product (bias, residual, hard-swish, limits). Whatever does not
+//! match stays as it is.
 
 mod swish;
 
@@ -205,7 +206,7 @@ fn per_channel(graph: &Graph<'_>, constant: ValueId, of: ValueId, map: bool) -> 
             .all(|(i, &n)| n == if i + missing == channel { to[channel] } else { 1 })
 }
 
-/// Bias, residual and limits into the product before them.
+/// Bias, residual, hard-swish and limits into the product before them.
 fn followers(graph: &mut Graph<'_>) {
     let uses = graph.uses();
     let mut consumer = vec![None; graph.values.len()];
@@ -249,7 +250,7 @@ fn absorbed(graph: &Graph<'_>, at: usize, next: usize) -> Option<(Op, Vec<ValueI
     match &mut op {
         Op::Conv { post, .. } | Op::MatMul { post } => {
             let b = inputs[1];
-            if post.clamp != UNLIMITED || !graph.is_constant(b) {
+            if post.clamp != UNLIMITED || post.swish || !graph.is_constant(b) {
                 return None;
             }
             let map = matches!(node.op, Op::Conv { .. });
@@ -268,6 +269,7 @@ fn absorbed(graph: &Graph<'_>, at: usize, next: usize) -> Option<(Op, Vec<ValueI
                         return None;
                     }
                 }
+                Op::Unary(Unary::HardSwish) => post.swish = true,
                 _ => post.clamp = limits?,
             }
         }

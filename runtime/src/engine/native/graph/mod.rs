@@ -210,13 +210,16 @@ impl Window {
     }
 }
 
-/// What is done to a product before it is stored: `clamp(product + bias + residual)`.
+/// What is done to a product before it is stored: `clamp(product + bias + residual)`, with a
+/// hard-swish before the limits if wanted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Post {
     /// One number per output channel; a constant.
     pub bias: Option<ValueId>,
     /// A tensor of the product's shape.
     pub residual: Option<ValueId>,
+    /// Whether the result is the hard-swish of the sum.
+    pub swish: bool,
     /// Range of the result.
     pub clamp: (f32, f32),
 }
@@ -226,7 +229,7 @@ pub const UNLIMITED: (f32, f32) = (f32::NEG_INFINITY, f32::INFINITY);
 
 impl Default for Post {
     fn default() -> Self {
-        Self { bias: None, residual: None, clamp: UNLIMITED }
+        Self { bias: None, residual: None, swish: false, clamp: UNLIMITED }
     }
 }
 

@@ -1,6 +1,6 @@
 //! Work per channel: depthwise convolutions and pooling, on maps with channels innermost.
 
-use super::simd::Simd;
+use super::simd::{Simd, hard_swish};
 use super::{Halo, Mem, Part, Pitch, Place};
 
 /// A convolution of every channel with its own kernel.
@@ -24,6 +24,8 @@ pub struct Depthwise {
     pub output: usize,
     /// From pixel to pixel of the result.
     pub output_pitch: Pitch,
+    /// Whether the result is the hard-swish of the sum.
+    pub swish: bool,
     /// Range of the result.
     pub clamp: (f32, f32),
     /// Zeros around the result.
@@ -39,17 +41,25 @@ pub unsafe fn depthwise<S: Simd>(s: &Depthwise, mem: Mem, part: Part) {
         if let Some(halo) = s.halo.as_ref().filter(|_| part.id == 0) {
             halo.clear(mem);
         }
-        match s.taps.len() {
-            9 => depthwise_of::<S, 9>(s, mem, part),
-            25 => depthwise_of::<S, 25>(s, mem, part),
-            _ => depthwise_of::<S, 0>(s, mem, part),
+        match (s.taps.len(), s.swish) {
+            (9, false) => depthwise_of::<S, 9, false>(s, mem, part),
+            (25, false) => depthwise_of::<S, 25, false>(s, mem, part),
+            (_, false) => depthwise_of::<S, 0, false>(s, mem, part),
+            (9, true) => depthwise_of::<S, 9, true>(s, mem, part),
+            (25, true) => depthwise_of::<S, 25, true>(s, mem, part),
+            (_, true) => depthwise_of::<S, 0, true>(s, mem, part),
         }
     }
 }
 
-/// `T` is the number of taps, 0 when it is none of those with code of their own.
+/// `T` is the number of taps, 0 when it is none of those with code of their own. Hard-swish is code of
+/// its own too: 25 weights leave no registers for constants that are not needed.
 #[inline(always)]
-unsafe fn depthwise_of<S: Simd, const T: usize>(s: &Depthwise, mem: Mem, part: Part) {
+unsafe fn depthwise_of<S: Simd, const T: usize, const SWISH: bool>(
+    s: &Depthwise,
+    mem: Mem,
+    part: Part,
+) {
     let [height, width] = s.size;
     let (low, high) = (s.clamp.0, s.clamp.1);
     // SAFETY: the check covers all taps of all windows, and all channels.
@@ -95,6 +105,9 @@ unsafe fn depthwise_of<S: Simd, const T: usize>(s: &Depthwise, mem: Mem, part: P
                             }
                         }
                         sum = S::add(sum, other);
+                    }
+                    if SWISH {
+                        sum = hard_swish::<S>(sum);
                     }
                     let y = S::at_most(high, S::at_least(low, sum));
                     let at = out.add(x * s.output_pitch.x + channel);

@@ -3,7 +3,7 @@
 //! bytes is a [`Gemm`] whose rows are a quarter as long: addresses, windows and panels are the same.
 
 use super::gemm::{Packing, Tile, TileFn};
-use super::simd::Simd;
+use super::simd::{Simd, hard_swish};
 use super::table::{MAX_ROWS, MAX_VECTORS};
 use super::{Halo, Mem, Part, Pitch, Place};
 
@@ -169,22 +169,41 @@ pub unsafe fn tile<D: Dot, const R: usize, const NV: usize>(t: &Tile) {
         }
         let (low, high) = (D::F::splat(t.clamp.0), D::F::splat(t.clamp.1));
         let whole = t.columns == NV * lanes;
+        // Every loop below is so small that it is unrolled and the sums stay in registers.
+        let mut sums = [[D::F::splat(0.0); NV]; R];
         for j in 0..NV {
             let at = t.column + j * lanes;
-            let n = if whole { lanes } else { (t.columns - j * lanes).min(lanes) };
             let (scale, bias) = (D::F::load(t.scales.add(at)), D::F::load(t.bias.add(at)));
             for r in 0..R {
-                let mut y = D::F::fma(D::floats(acc[r][j]), scale, bias);
-                if t.residual {
+                sums[r][j] = D::F::fma(D::floats(acc[r][j]), scale, bias);
+            }
+        }
+        let rest = |j: usize| if whole { lanes } else { (t.columns - j * lanes).min(lanes) };
+        if t.residual {
+            for j in 0..NV {
+                let at = t.column + j * lanes;
+                for r in 0..R {
                     let p = t.r[r].add(at);
-                    let residual = if whole { D::F::load(p) } else { D::F::load_n(p, n) };
-                    y = D::F::add(y, residual);
+                    let residual = if whole { D::F::load(p) } else { D::F::load_n(p, rest(j)) };
+                    sums[r][j] = D::F::add(sums[r][j], residual);
                 }
-                let y = D::F::at_most(high, D::F::at_least(low, y));
+            }
+        }
+        if t.swish {
+            for r in 0..R {
+                for j in 0..NV {
+                    sums[r][j] = hard_swish::<D::F>(sums[r][j]);
+                }
+            }
+        }
+        for j in 0..NV {
+            let at = t.column + j * lanes;
+            for r in 0..R {
+                let y = D::F::at_most(high, D::F::at_least(low, sums[r][j]));
                 if whole {
                     D::F::store(t.c[r].add(at), y);
                 } else {
-                    D::F::store_n(t.c[r].add(at), y, n);
+                    D::F::store_n(t.c[r].add(at), y, rest(j));
                 }
             }
         }

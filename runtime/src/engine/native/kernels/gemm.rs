@@ -1,7 +1,7 @@
 //! Products with constant matrices: convolutions as implicit GEMM and linear layers. Rows are
 //! pixels or tokens wherever they lie; weights are packed into panels, in the order they are read.
 
-use super::simd::Simd;
+use super::simd::{Simd, hard_swish};
 use super::table::{Kernels, MAX_ROWS, MAX_VECTORS};
 use super::{Halo, Mem, Part, Pitch, Place};
 
@@ -12,7 +12,7 @@ const RESIDENT: usize = 96 * 1024;
 /// Computes one tile.
 pub type TileFn = unsafe fn(&Tile);
 
-/// `out = clamp(in * weights + bias + residual)`.
+/// `out = clamp(in * weights + bias + residual)`, with a hard-swish before the limits if wanted.
 #[derive(Clone, Debug)]
 pub struct Gemm {
     /// Rows: lines and pixels per line.
@@ -37,6 +37,8 @@ pub struct Gemm {
     pub output_pitch: Pitch,
     /// Added before the limits; same size as the result.
     pub residual: Option<(Place, Pitch)>,
+    /// Whether the result is the hard-swish of the sum.
+    pub swish: bool,
     /// Range of the result.
     pub clamp: (f32, f32),
     /// Zeros around the result.
@@ -121,6 +123,8 @@ pub struct Tile {
     pub residual: bool,
     /// Factors of the rows, or null.
     pub factors: *const f32,
+    /// Whether the hard-swish of the sums is stored.
+    pub swish: bool,
     /// Range of the result.
     pub clamp: (f32, f32),
 }
@@ -140,6 +144,7 @@ impl Tile {
         scales: core::ptr::null(),
         residual: false,
         factors: core::ptr::null(),
+        swish: false,
         clamp: (f32::NEG_INFINITY, f32::INFINITY),
     };
 }
@@ -234,6 +239,13 @@ pub unsafe fn tile<S: Simd, const R: usize, const NV: usize>(t: &Tile) {
                     }
                 }
             }
+            if t.swish {
+                for r in 0..R {
+                    for j in 0..NV {
+                        acc[r][j] = hard_swish::<S>(acc[r][j]);
+                    }
+                }
+            }
             let (low, high) = (S::splat(t.clamp.0), S::splat(t.clamp.1));
             for r in 0..R {
                 for j in 0..NV {
@@ -269,6 +281,9 @@ unsafe fn ragged<S: Simd, const R: usize, const NV: usize>(
                 let mut y = S::load(sums.as_ptr());
                 if t.residual {
                     y = S::add(y, S::load_n(t.r[r].add(at), n));
+                }
+                if t.swish {
+                    y = hard_swish::<S>(y);
                 }
                 S::store_n(t.c[r].add(at), S::at_most(high, S::at_least(low, y)), n);
             }
@@ -350,6 +365,7 @@ impl Gemm {
                 bias: self.bias.map_or(core::ptr::null(), |at| mem.weights.add(at)),
                 scales: self.scales.map_or(core::ptr::null(), |at| mem.weights.add(at)),
                 residual: self.residual.is_some(),
+                swish: self.swish,
                 clamp: self.clamp,
                 ..Tile::EMPTY
             };

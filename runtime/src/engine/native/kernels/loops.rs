@@ -1,6 +1,7 @@
 //! Element by element: copies between layouts, functions of one and two tensors, reductions. The
 //! tensors may have any strides.
 
+use super::simd::{self, Simd};
 use super::{Mem, Part, Place};
 use crate::engine::native::graph::{Binary, Reduce, Unary};
 
@@ -98,20 +99,32 @@ impl<const N: usize> Nest<N> {
         if cut.is_empty() {
             return;
         }
-        for i in loops {
-            let mut rest = i;
-            let mut at = [0; N];
+        let mut index = [0; RANK - 1];
+        let mut at: [usize; N] = core::array::from_fn(|t| cut.start * self.inner(t));
+        let mut rest = loops.start;
+        for d in (0..RANK - 1).rev() {
+            index[d] = rest % self.size[d];
+            rest /= self.size[d];
+            for t in 0..N {
+                at[t] += index[d] * self.stride[t][d];
+            }
+        }
+        for _ in loops {
+            f(at, cut.len());
+            // To the next loop without a division: inner loops can be as short as a few channels.
             for d in (0..RANK - 1).rev() {
-                let index = rest % self.size[d];
-                rest /= self.size[d];
+                index[d] += 1;
                 for t in 0..N {
-                    at[t] += index * self.stride[t][d];
+                    at[t] += self.stride[t][d];
+                }
+                if index[d] < self.size[d] {
+                    break;
+                }
+                index[d] = 0;
+                for t in 0..N {
+                    at[t] -= self.size[d] * self.stride[t][d];
                 }
             }
-            for t in 0..N {
-                at[t] += cut.start * self.stride[t][RANK - 1];
-            }
-            f(at, cut.len());
         }
     }
 
@@ -131,24 +144,53 @@ pub struct Copy {
     pub output: usize,
 }
 
+/// Colours of a picture, which lie as planes before the first convolution.
+const PLANES: usize = 3;
+
 impl Copy {
-    /// # Safety
-    /// The step was checked, nobody else touches the result.
-    pub(super) unsafe fn run(&self, mem: Mem, part: Part) {
-        // SAFETY: offsets of the nest, which the check covers.
-        unsafe {
-            let (from, to) = (mem.at(self.input), mem.arena.add(self.output));
-            let (a, c) = (self.nest.inner(0), self.nest.inner(1));
-            self.nest.each(part, |[i, o], n| {
-                if (a, c) == (1, 1) {
-                    core::ptr::copy_nonoverlapping(from.add(i), to.add(o), n);
-                } else {
-                    for k in 0..n {
-                        *to.add(o + k * c) = *from.add(i + k * a);
+    /// Planes into pixels: the distance of the planes, and the loops over their lines.
+    fn interleaved(&self) -> Option<(usize, Nest<2>)> {
+        let mut lines = self.nest.clone();
+        let [from, to] = &lines.stride;
+        let planes = lines.size[RANK - 2] == PLANES
+            && (from[RANK - 1], to[RANK - 1]) == (1, PLANES)
+            && to[RANK - 2] == 1;
+        let apart = from[RANK - 2];
+        lines.size[RANK - 2] = 1;
+        planes.then_some((apart, lines))
+    }
+}
+
+/// # Safety
+/// The step was checked, nobody else touches the result.
+#[inline(always)]
+pub unsafe fn copy(s: &Copy, mem: Mem, part: Part) {
+    // SAFETY: offsets of the nest, which the check covers.
+    unsafe {
+        let (from, to) = (mem.at(s.input), mem.arena.add(s.output));
+        if let Some((apart, lines)) = s.interleaved() {
+            lines.each(part, |[i, o], n| {
+                let planes = [0, 1, 2].map(|p| from.add(i + p * apart));
+                let to = to.add(o);
+                // All colours of a pixel in one go, which compilers turn into shuffles.
+                for k in 0..n {
+                    for p in 0..PLANES {
+                        *to.add(k * PLANES + p) = *planes[p].add(k);
                     }
                 }
             });
+            return;
         }
+        let (a, c) = (s.nest.inner(0), s.nest.inner(1));
+        s.nest.each(part, |[i, o], n| {
+            if (a, c) == (1, 1) {
+                core::ptr::copy_nonoverlapping(from.add(i), to.add(o), n);
+            } else {
+                for k in 0..n {
+                    *to.add(o + k * c) = *from.add(i + k * a);
+                }
+            }
+        });
     }
 }
 
@@ -251,56 +293,70 @@ pub struct Zip {
 }
 
 /// # Safety
-/// The step was checked, nobody else touches the result.
+/// The step was checked, the instruction set is there, nobody else touches the result.
 #[inline(always)]
-pub unsafe fn zip(s: &Zip, mem: Mem, part: Part) {
+pub unsafe fn zip<S: Simd>(s: &Zip, mem: Mem, part: Part) {
     // SAFETY: passed on.
     unsafe {
         match s.op {
-            Binary::Add => zip_with(s, mem, part, |a, b| a + b),
-            Binary::Sub => zip_with(s, mem, part, |a, b| a - b),
-            Binary::Mul => zip_with(s, mem, part, |a, b| a * b),
-            Binary::Div => zip_with(s, mem, part, |a, b| a / b),
-            Binary::Min => zip_with(s, mem, part, |a, b| if b < a { b } else { a }),
-            Binary::Max => zip_with(s, mem, part, |a, b| if b > a { b } else { a }),
-            Binary::Pow => zip_with(s, mem, part, f32::powf),
-            Binary::MulHardSwish => zip_with(s, mem, part, |a, b| hard_swish(a * b)),
+            Binary::Add => zip_vectors::<S>(s, mem, part, |a, b| S::add(a, b)),
+            Binary::Sub => zip_vectors::<S>(s, mem, part, |a, b| S::sub(a, b)),
+            Binary::Mul => zip_vectors::<S>(s, mem, part, |a, b| S::mul(a, b)),
+            Binary::Min => zip_vectors::<S>(s, mem, part, |a, b| S::at_most(b, a)),
+            Binary::Max => zip_vectors::<S>(s, mem, part, |a, b| S::at_least(b, a)),
+            Binary::MulHardSwish => {
+                zip_vectors::<S>(s, mem, part, |a, b| simd::hard_swish::<S>(S::mul(a, b)));
+            }
+            Binary::Div => zip_numbers(s, mem, part, |a, b| a / b),
+            Binary::Pow => zip_numbers(s, mem, part, f32::powf),
         }
     }
 }
 
+/// Whole vectors where the elements lie side by side, one of the operands possibly one number for
+/// all; element by element otherwise.
 #[inline(always)]
-unsafe fn zip_with(s: &Zip, mem: Mem, part: Part, f: impl Fn(f32, f32) -> f32) {
-    // SAFETY: offsets of the nest, which the check covers.
+unsafe fn zip_vectors<S: Simd>(s: &Zip, mem: Mem, part: Part, f: impl Fn(S::V, S::V) -> S::V) {
+    // SAFETY: offsets of the nest, which the check covers; the caller promises the instruction set.
     unsafe {
         let (left, right) = (mem.at(s.inputs[0]), mem.at(s.inputs[1]));
         let to = mem.arena.add(s.output);
         let (a, b, c) = (s.nest.inner(0), s.nest.inner(1), s.nest.inner(2));
         s.nest.each(part, |[i, j, o], n| {
             let (left, right, to) = (left.add(i), right.add(j), to.add(o));
-            match (a, b, c) {
-                (1, 1, 1) => {
-                    for k in 0..n {
-                        *to.add(k) = f(*left.add(k), *right.add(k));
-                    }
+            if a > 1 || b > 1 || c != 1 {
+                for k in 0..n {
+                    let y = f(S::splat(*left.add(k * a)), S::splat(*right.add(k * b)));
+                    S::store_n(to.add(k * c), y, 1);
                 }
-                (1, 0, 1) => {
-                    let y = *right;
-                    for k in 0..n {
-                        *to.add(k) = f(*left.add(k), y);
-                    }
-                }
-                (0, 1, 1) => {
-                    let x = *left;
-                    for k in 0..n {
-                        *to.add(k) = f(x, *right.add(k));
-                    }
-                }
-                _ => {
-                    for k in 0..n {
-                        *to.add(k * c) = f(*left.add(k * a), *right.add(k * b));
-                    }
-                }
+                return;
+            }
+            let mut k = 0;
+            while k + S::LANES <= n {
+                let x = if a == 1 { S::load(left.add(k)) } else { S::splat(*left) };
+                let y = if b == 1 { S::load(right.add(k)) } else { S::splat(*right) };
+                S::store(to.add(k), f(x, y));
+                k += S::LANES;
+            }
+            if k < n {
+                let x = if a == 1 { S::load_n(left.add(k), n - k) } else { S::splat(*left) };
+                let y = if b == 1 { S::load_n(right.add(k), n - k) } else { S::splat(*right) };
+                S::store_n(to.add(k), f(x, y), n - k);
+            }
+        });
+    }
+}
+
+#[inline(always)]
+unsafe fn zip_numbers(s: &Zip, mem: Mem, part: Part, f: impl Fn(f32, f32) -> f32) {
+    // SAFETY: offsets of the nest, which the check covers.
+    unsafe {
+        let (left, right) = (mem.at(s.inputs[0]), mem.at(s.inputs[1]));
+        let to = mem.arena.add(s.output);
+        let (a, b, c) = (s.nest.inner(0), s.nest.inner(1), s.nest.inner(2));
+        s.nest.each(part, |[i, j, o], n| {
+            for k in 0..n {
+                *to.add(o + k * c) = f(*left.add(i + k * a), *right.add(j + k * b));
             }
         });
     }
@@ -325,32 +381,76 @@ pub struct Fold {
 /// The step was checked, nobody else touches the result.
 #[inline(always)]
 pub unsafe fn fold(s: &Fold, mem: Mem, part: Part) {
+    // In f64, so that long sums need no special order.
+    let (zero, count) = (0.0f64, s.inner.len() as f64);
+    let add = |sum: f64, x: f32| sum + f64::from(x);
+    let join = |a: f64, b: f64| a + b;
+    let (low, high) = (f32::NEG_INFINITY, f32::INFINITY);
+    // SAFETY: passed on.
+    unsafe {
+        match s.kind {
+            Reduce::Sum => fold_with(s, mem, part, zero, add, join, |sum| sum as f32),
+            Reduce::Mean => fold_with(s, mem, part, zero, add, join, |sum| (sum / count) as f32),
+            Reduce::Max => fold_with(s, mem, part, low, f32::max, f32::max, |x| x),
+            Reduce::Min => fold_with(s, mem, part, high, f32::min, f32::min, |x| x),
+        }
+    }
+}
+
+/// Partial results side by side, so that none waits for the one before.
+const ABREAST: usize = 16;
+
+/// Results side by side are computed together; a single one is joined from the elements of every
+/// sixteenth place where those of a run lie side by side.
+#[inline(always)]
+unsafe fn fold_with<A: core::marker::Copy>(
+    s: &Fold,
+    mem: Mem,
+    part: Part,
+    start: A,
+    add: impl Fn(A, f32) -> A,
+    join: impl Fn(A, A) -> A,
+    end: impl Fn(A) -> f32,
+) {
     let all = Part { id: 0, of: 1 };
     // SAFETY: offsets of the nests, which the check covers.
     unsafe {
         let (from, to) = (mem.at(s.input), mem.arena.add(s.output));
         let (a, c) = (s.outer.inner(0), s.outer.inner(1));
+        let step = s.inner.inner(0);
         s.outer.each(part, |[i, o], n| {
-            for k in 0..n {
-                let from = from.add(i + k * a);
-                // In f64, so that long sums need no special order.
-                let mut sum = 0.0f64;
-                let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
-                let step = s.inner.inner(0);
+            let together = if a == 1 { n / ABREAST * ABREAST } else { 0 };
+            for k in (0..together).step_by(ABREAST) {
+                let from = from.add(i + k);
+                let mut sums = [start; ABREAST];
                 s.inner.each(all, |[i], n| {
-                    for k in 0..n {
-                        let x = *from.add(i + k * step);
-                        sum += f64::from(x);
-                        low = low.min(x);
-                        high = high.max(x);
+                    for j in 0..n {
+                        let from = from.add(i + j * step);
+                        for l in 0..ABREAST {
+                            sums[l] = add(sums[l], *from.add(l));
+                        }
                     }
                 });
-                *to.add(o + k * c) = match s.kind {
-                    Reduce::Sum => sum as f32,
-                    Reduce::Mean => (sum / s.inner.len() as f64) as f32,
-                    Reduce::Max => high,
-                    Reduce::Min => low,
-                };
+                for (l, &sum) in sums.iter().enumerate() {
+                    *to.add(o + (k + l) * c) = end(sum);
+                }
+            }
+            for k in together..n {
+                let from = from.add(i + k * a);
+                let (mut sums, mut sum) = ([start; ABREAST], start);
+                s.inner.each(all, |[i], n| {
+                    let from = from.add(i);
+                    let whole = if step == 1 { n / ABREAST * ABREAST } else { 0 };
+                    for j in (0..whole).step_by(ABREAST) {
+                        for l in 0..ABREAST {
+                            sums[l] = add(sums[l], *from.add(j + l));
+                        }
+                    }
+                    for j in whole..n {
+                        sum = add(sum, *from.add(j * step));
+                    }
+                });
+                *to.add(o + k * c) = end(sums.into_iter().fold(sum, &join));
             }
         });
     }

@@ -7,6 +7,7 @@ use super::{
     PackKv, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
 };
 use crate::engine::native::sync::Barrier;
+use std::time::{Duration, Instant};
 
 /// Work below which a step is done by one thread: less than a few microseconds.
 const WORTH_SHARING: usize = 100_000;
@@ -415,7 +416,7 @@ impl Step {
                 Self::Quantise(s) => (k.eight.quantise)(s, mem, part),
                 Self::Depthwise(s) => (k.depthwise)(s, mem, part),
                 Self::Pool(s) => (k.pool)(s, mem, part),
-                Self::Copy(s) => s.run(mem, part),
+                Self::Copy(s) => (k.copy)(s, mem, part),
                 Self::Map(s) => (k.map)(s, mem, part),
                 Self::Zip(s) => (k.zip)(s, mem, part),
                 Self::Fold(s) => (k.fold)(s, mem, part),
@@ -490,6 +491,19 @@ impl Program {
             && self.weights <= weights
             && self.threads == threads
             && core::ptr::eq(self.kernels, k)
+    }
+
+    /// Runs everything on the calling thread alone and lowers `shortest[i]` to the time of step `i`.
+    ///
+    /// # Safety
+    /// As for [`Self::run`]; the other threads of the team are at rest.
+    pub(super) unsafe fn time(&self, k: &Kernels, mem: Mem, shortest: &mut [Duration]) {
+        for (planned, shortest) in self.steps.iter().zip(shortest) {
+            let start = Instant::now();
+            // SAFETY: the steps were checked, and run one after the other.
+            unsafe { planned.step.run(k, mem, Part { id: 0, of: 1 }) }
+            *shortest = start.elapsed().min(*shortest);
+        }
     }
 
     /// One thread's part of everything.

@@ -61,6 +61,16 @@ pub unsafe fn exp<S: Simd>(x: S::V) -> S::V {
     }
 }
 
+/// `x * clamp(x / 6 + 1 / 2, 0, 1)`.
+#[inline(always)]
+pub unsafe fn hard_swish<S: Simd>(x: S::V) -> S::V {
+    // SAFETY: the caller promises the instruction set.
+    unsafe {
+        let gate = S::fma(x, S::splat(1.0 / 6.0), S::splat(0.5));
+        S::mul(x, S::at_most(S::splat(1.0), S::at_least(S::splat(0.0), gate)))
+    }
+}
+
 /// Plain Rust: any processor, and Miri.
 #[derive(Clone, Copy)]
 pub struct Scalar;

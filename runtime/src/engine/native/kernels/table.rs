@@ -4,7 +4,7 @@ use super::attention::{self, Attention, ThinAttention};
 use super::conv::{self, Depthwise, Pool};
 use super::eight::{self, Dot, Eight, Quantise, ScalarDot};
 use super::gemm::{self, Packing, Tile, TileFn};
-use super::loops::{self, Fold, Map, Zip};
+use super::loops::{self, Copy, Fold, Map, Zip};
 use super::matmul::{self, MatMul};
 use super::norms::{self, LayerNorm, MapNorm, Softmax};
 use super::simd::{Scalar, Simd};
@@ -95,6 +95,7 @@ pub struct Kernels {
     pub(super) layer_norm: unsafe fn(&LayerNorm, Mem, Part),
     pub(super) softmax: unsafe fn(&Softmax, Mem, Part),
     pub(super) map_norm: unsafe fn(&MapNorm, Mem, Part),
+    pub(super) copy: unsafe fn(&Copy, Mem, Part),
     pub(super) map: unsafe fn(&Map, Mem, Part),
     pub(super) zip: unsafe fn(&Zip, Mem, Part),
     pub(super) fold: unsafe fn(&Fold, Mem, Part),
@@ -128,8 +129,9 @@ macro_rules! table {
                 layer_norm(s: &LayerNorm, m: Mem, p: Part) => norms::layer_norm::<$set>(s, m, p);
                 softmax(s: &Softmax, m: Mem, p: Part) => norms::softmax::<$set>(s, m, p);
                 map_norm(s: &MapNorm, m: Mem, p: Part) => norms::map_norm::<$set>(s, m, p);
+                copy(s: &Copy, m: Mem, p: Part) => loops::copy(s, m, p);
                 map(s: &Map, m: Mem, p: Part) => loops::map(s, m, p);
-                zip(s: &Zip, m: Mem, p: Part) => loops::zip(s, m, p);
+                zip(s: &Zip, m: Mem, p: Part) => loops::zip::<$set>(s, m, p);
                 fold(s: &Fold, m: Mem, p: Part) => loops::fold(s, m, p);
                 matmul(s: &MatMul, m: Mem, p: Part) => matmul::matmul::<$set>(s, m, p);
                 thin(s: &ThinAttention, m: Mem, p: Part) => attention::thin::<$set>(s, m, p);
@@ -154,6 +156,7 @@ macro_rules! table {
                 layer_norm,
                 softmax,
                 map_norm,
+                copy,
                 map,
                 zip,
                 fold,

@@ -9,6 +9,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 /// Floats of a cache line, to which arena and weights are aligned.
 const LINE: usize = 16;
@@ -172,6 +173,19 @@ impl Team {
         shared.program.store(program, Ordering::Release);
         shared.start.advance();
         shared.work(program, 0);
+    }
+
+    /// Runs a program on the calling thread alone and lowers `shortest[i]` to the time of its step
+    /// `i`.
+    ///
+    /// # Panics
+    /// When there is no such program.
+    pub fn time(&mut self, program: usize, shortest: &mut [Duration]) {
+        let shared = &*self.shared;
+        let mem = Mem { arena: shared.arena.start(), weights: shared.weights.as_ptr() };
+        // SAFETY: the program was checked against memory of this size; the team is borrowed
+        // exclusively, so its other threads wait for the next run.
+        unsafe { shared.programs[program].time(shared.kernels, mem, shortest) }
     }
 
     /// Part of the arena.

@@ -2,6 +2,7 @@
 //! written out, over odd sizes, strides and alignments.
 
 mod eight;
+mod loops;
 
 use super::*;
 use crate::engine::native::graph::{Binary, Reduce, Unary};
@@ -84,7 +85,7 @@ proptest! {
     fn products(
         (h, w, c, n) in (1usize..8, 1usize..9, 1usize..20, 1usize..71),
         (kernel, stride, halo) in (prop::sample::select(vec![1usize, 3]), 1usize..3, 0usize..2),
-        (gap, with, threads) in (0usize..5, 0usize..4, 1usize..4),
+        (gap, with, swish, threads) in (0usize..5, 0usize..4, any::<bool>(), 1usize..4),
     ) {
         let pad = kernel / 2;
         let (oh, ow) = ((h + 2 * pad - kernel) / stride + 1, (w + 2 * pad - kernel) / stride + 1);
@@ -120,6 +121,7 @@ proptest! {
                 output,
                 output_pitch: Pitch { y: out_line, x: out_pixel },
                 residual: (with & 2 == 2).then_some(residual),
+                swish,
                 clamp: if with == 3 { (0.0, 6.0) } else { (f32::NEG_INFINITY, f32::INFINITY) },
                 halo: (halo > 0).then_some(border),
                 block: 1 + gap * 8,
@@ -161,6 +163,9 @@ proptest! {
                 if with & 2 == 2 {
                     sum += f64::from(residual[(y * ow + x) * n + column]);
                 }
+                if swish {
+                    sum *= (sum / 6.0 + 0.5).clamp(0.0, 1.0);
+                }
                 Some(if with == 3 { sum.clamp(0.0, 6.0) } else { sum } as f32)
             })
         })?;
@@ -170,7 +175,7 @@ proptest! {
     fn depthwise_convolutions(
         (h, w, c) in (1usize..7, 1usize..8, 1usize..40),
         (kernel, stride, bias) in (prop::sample::select(vec![2usize, 3, 5]), 1usize..3, any::<bool>()),
-        threads in 1usize..4,
+        (swish, threads) in (any::<bool>(), 1usize..4),
     ) {
         let (full_h, full_w) = ((h - 1) * stride + kernel, (w - 1) * stride + kernel);
         let input = numbers(full_h * full_w * c, 1);
@@ -188,6 +193,7 @@ proptest! {
                 bias: bias.then_some(1 + taps * c),
                 output: input.len(),
                 output_pitch: Pitch { y: w * (c + 1), x: c + 1 },
+                swish,
                 clamp: (-2.0, 6.0),
                 halo: None,
             });
@@ -206,7 +212,8 @@ proptest! {
                     input[at] * weights[1 + t * c + ch]
                 });
                 let sum = products.sum::<f32>() + if bias { weights[1 + taps * c + ch] } else { 0.0 };
-                Some(sum.clamp(-2.0, 6.0))
+                let gate = if swish { (sum / 6.0 + 0.5).clamp(0.0, 1.0) } else { 1.0 };
+                Some((sum * gate).clamp(-2.0, 6.0))
             })
         })?;
     }
@@ -403,45 +410,6 @@ proptest! {
                 })?;
             }
         }
-    }
-
-    #[test]
-    fn element_by_element(
-        shape in prop::array::uniform3(1usize..7),
-        order in Just(vec![0usize, 1, 2]).prop_shuffle(),
-        (op, broadcast, threads) in (0usize..4, 0usize..8, 1usize..4),
-    ) {
-        let len: usize = shape.iter().product();
-        let input = numbers(2 * len, 1);
-        let dense = [shape[1] * shape[2], shape[2], 1];
-        let mut other = [0; 3];
-        let mut next = 1;
-        for &i in order.iter().rev() {
-            other[i] = next;
-            next *= shape[i];
-        }
-        let right: [usize; 3] = core::array::from_fn(|i| if broadcast >> i & 1 == 1 { 0 } else { dense[i] });
-        let op = [Binary::Add, Binary::Sub, Binary::Mul, Binary::Max][op];
-        let nest = Nest::new(&shape, [&other, &right, &dense]).unwrap();
-        let inputs = [Place::Arena(0), Place::Arena(len)];
-        let step = |_: &'static Kernels| {
-            (Step::Zip(Zip { op, nest: nest.clone(), inputs, output: 2 * len }), vec![0.0])
-        };
-        for_all(step, threads, |name, step, k, weights, threads| {
-            let found = run(step, k, threads, &input, 3 * len, weights);
-            compare(name, &found, 2 * len, |i| {
-                let j = i - 2 * len;
-                let at = [j / dense[0], j / dense[1] % shape[1], j % shape[2]];
-                let index = |s: &[usize; 3]| (0..3).map(|d| at[d] * s[d]).sum::<usize>();
-                let (a, b) = (input[index(&other)], input[len + index(&right)]);
-                Some(match op {
-                    Binary::Add => a + b,
-                    Binary::Sub => a - b,
-                    Binary::Mul => a * b,
-                    _ => a.max(b),
-                })
-            })
-        })?;
     }
 
     #[test]

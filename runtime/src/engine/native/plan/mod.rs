@@ -91,11 +91,24 @@ pub struct ProgramSummary {
     pub kinds: Vec<(&'static str, usize, usize)>,
 }
 
+/// What a step is, for reports.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StepLabel {
+    /// Kind of kernel.
+    pub kind: &'static str,
+    /// Node of the graph that it computes or is part of.
+    pub node: Box<str>,
+    /// Floating-point operations, about.
+    pub operations: usize,
+}
+
 /// Everything a [`super::kernels::Team`] needs.
 #[derive(Debug)]
 pub struct Plan {
     /// One per graph, in the order they were added; the first one runs once, at load.
     pub programs: Vec<Program>,
+    /// One per step of every program.
+    pub labels: Vec<Box<[StepLabel]>>,
     /// See [`ProgramSummary`], in the same order.
     pub summaries: Vec<ProgramSummary>,
     /// Constants.
@@ -216,6 +229,7 @@ impl Planner {
         }
         let mut plan = Plan {
             programs: Vec::with_capacity(placed.len()),
+            labels: Vec::with_capacity(placed.len()),
             summaries: Vec::with_capacity(placed.len()),
             arena,
             lasting,
@@ -238,6 +252,12 @@ impl Planner {
                 }
             }
             let nodes = routine.nodes;
+            let label = |(step, node): (&Step, &String)| StepLabel {
+                kind: step.name(),
+                node: node.as_str().into(),
+                operations: step.cost().operations,
+            };
+            plan.labels.push(routine.steps.iter().zip(&nodes).map(label).collect());
             let program = Program::new(routine.steps, arena, plan.weights.len(), threads, kernels)
                 .map_err(|(i, what)| fault(&nodes[i], what))?;
             plan.programs.push(program);

@@ -41,7 +41,7 @@ proptest! {
     fn products_of_bytes(
         (h, w, c, n) in (1usize..6, 1usize..9, 1usize..23, 1usize..71),
         (kernel, stride) in (prop::sample::select(vec![1usize, 3]), 1usize..3),
-        (gap, with, threads) in (0usize..3, 0usize..4, 1usize..4),
+        (gap, with, swish, threads) in (0usize..3, 0usize..4, any::<bool>(), 1usize..4),
     ) {
         let pad = kernel / 2;
         let (ih, iw) = (h + 2 * pad, w + 2 * pad);
@@ -92,6 +92,7 @@ proptest! {
                 output,
                 output_pitch: Pitch { y: ow * n, x: n },
                 residual: (with & 2 == 2).then_some(residual_at),
+                swish,
                 clamp,
                 halo: None,
                 block: 1 + gap * 8,
@@ -110,9 +111,12 @@ proptest! {
                     sum += a * i32::from(weight(t, channel, j));
                 }
                 let add = if with & 2 == 2 { residual[i] } else { 0.0 };
-                let want = (sum as f32 * scales[j] + bias[j] + add).clamp(clamp.0, clamp.1);
+                let sum = sum as f32 * scales[j] + bias[j] + add;
+                let gate = if swish { (sum / 6.0 + 0.5).clamp(0.0, 1.0) } else { 1.0 };
+                let want = (sum * gate).clamp(clamp.0, clamp.1);
                 let v = found[output + i];
-                let room = 1e-6 * scales[j] * (area * c) as f32 * 65_000.0;
+                // Hard-swish is at most 1.5 times as steep as its operand.
+                let room = 1.5e-6 * scales[j] * (area * c) as f32 * 65_000.0;
                 prop_assert!((v - want).abs() <= room + 1e-5, "{name}: {v}, not {want} at {i}");
             }
             prop_assert_eq!(&found[end..], &[UNTOUCHED; 3][..]);

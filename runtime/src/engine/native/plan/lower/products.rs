@@ -67,6 +67,7 @@ impl Lower<'_, '_, '_> {
                 bias,
                 output: target.output,
                 output_pitch: target.pitch,
+                swish: post.swish,
                 clamp: post.clamp,
                 halo: target.halo,
             }));
@@ -131,6 +132,7 @@ impl Lower<'_, '_, '_> {
                 output: target.output + g * columns,
                 output_pitch: target.pitch,
                 residual: residual.map(shifted),
+                swish: post.swish,
                 clamp: post.clamp,
                 halo: target.halo.filter(|_| g == 0),
                 block: BLOCK / footprint.max(1),
@@ -222,6 +224,7 @@ impl Lower<'_, '_, '_> {
             scales,
             columns,
             residual,
+            swish: post.swish,
             clamp: post.clamp,
             ..gemm
         })?;
@@ -249,6 +252,7 @@ impl Lower<'_, '_, '_> {
             output: address(to)?,
             output_pitch: pitch.1,
             residual: None,
+            swish: false,
             clamp: (f32::NEG_INFINITY, f32::INFINITY),
             halo: None,
             block: BLOCK / depth.max(1),
