@@ -298,11 +298,11 @@ pub fn ranges(
     let mut runners = Vec::with_capacity(2);
     for params in [deployed, eager] {
         let engine = Watching::new(bundle, files, products, seen.clone())?;
-        let tracker = Tracker::new(engine, params).map_err(|e| QuantizeError::Track {
-            sequence: data.name.clone(),
-            frame: 0,
-            source: TrackerError::new(e),
-        })?;
+        let failed =
+            |source| QuantizeError::Track { sequence: data.name.clone(), frame: 0, source };
+        let mut tracker = Tracker::new(engine, params).map_err(|e| failed(TrackerError::new(e)))?;
+        let motion = bundle.manifest().motion;
+        tracker.set_motion_prior(motion).map_err(|e| failed(TrackerError::new(e)))?;
         runners.push(Runner::new(tracker));
     }
     let tracked = track(&mut runners, data, frames)?;

@@ -75,8 +75,10 @@ pub fn losses(
             progress(&format!("measuring on {name}, {protocol}, {which}"));
             let make = || {
                 let engine = NativeEngine::from_bundle(bundle).map_err(TrackerError::new)?;
-                let tracker =
-                    Tracker::new(engine, bundle.manifest().tracker).map_err(TrackerError::new)?;
+                let manifest = bundle.manifest();
+                let mut tracker =
+                    Tracker::new(engine, manifest.tracker).map_err(TrackerError::new)?;
+                tracker.set_motion_prior(manifest.motion).map_err(TrackerError::new)?;
                 Ok(Box::new(Runner::new(tracker)) as Box<dyn TrackerUnderTest>)
             };
             let found = evaluate(data, protocol, &make, Options::default(), &|_| {})?;
