@@ -143,9 +143,12 @@ fn several_devices_take_the_step_of_one() {
     experiment.align.start_step = Some(0);
     experiment.optim.clip_norm = 1.0;
     let batches = parts(&batch(), 4);
+    // Drawn once: burn's random generator is shared with the tests beside this one.
+    let branches = state(&experiment, false).align.unwrap().branches;
     let stepped = |devices: usize| {
         let devices = vec![Device::flex().autodiff(); devices];
         let mut state = state(&experiment, false);
+        state.align.as_mut().unwrap().branches = branches.clone();
         let mut losses = Vec::new();
         for _ in 0..2 {
             let rates = Rates {
