@@ -48,7 +48,7 @@ fn the_shipped_model_passes_its_own_check() {
     let failed = tsda(dir.path(), &["verify", "--tolerance", "0"]);
     assert_eq!(failed.status.code(), Some(1), "no engine is exact to the last bit");
     let info = ok(&tsda(dir.path(), &["info"]));
-    for word in ["features.onnx", "licence"] {
+    for word in ["features.onnx", "licence", "NanoTrack v3"] {
         assert!(info.contains(word), "{word} in {info}");
     }
 }
