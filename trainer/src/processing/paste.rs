@@ -82,7 +82,11 @@ pub(super) fn cover(pixels: &mut Pixels, target: &BBox, rng: &mut impl Rng) -> b
     let slide = |length: i64, share: f32| (length as f32 * share) as i64;
     let mut places = [(-w, 0), (w, 0), (0, -h), (0, h)].map(|(dx, dy)| {
         let along = 0.5 * (rng.random::<f32>() - 0.5);
-        if dx == 0 { (slide(w, along), dy) } else { (dx, slide(h, along)) }
+        if dx == 0 {
+            (slide(w, along).clamp(-left, side - right), dy)
+        } else {
+            (dx, slide(h, along).clamp(-top, side - bottom))
+        }
     });
     let first = rng.random_range(0..places.len());
     places.rotate_left(first);
