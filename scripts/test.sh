@@ -1,18 +1,18 @@
 #!/usr/bin/env bash
 # Runs every test of the workspace. Where Python is found, the packages that check our ONNX files
-# from outside (onnx, onnxruntime) are installed once into target/py, and the ONNX Runtime library
-# among them serves the tests of our own ONNX Runtime engine; without Python or network the tests
-# that need them say "skipped" and the rest runs all the same.
+# and recordings from outside (onnx, onnxruntime, mcap and others) are installed once into target/py,
+# and the ONNX Runtime library among them serves the tests of our own ONNX Runtime engine; without
+# Python or network the tests that need them say "skipped" and the rest runs all the same.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 target="${CARGO_TARGET_DIR:-target}"
 venv="$target/py"
-want="onnx>=1.17 onnxruntime>=1.20 numpy pillow"
+want="onnx>=1.17 onnxruntime>=1.20 numpy pillow mcap>=1.6 jsonschema foxglove-schemas-protobuf pybag-sdk"
 
 prepare_python() {
-  command -v python3 >/dev/null || { echo "python3 not found: the ONNX checks from Python are skipped"; return 1; }
-  if [ -x "$venv/bin/python" ] && "$venv/bin/python" -c 'import onnx, onnxruntime, numpy, PIL' 2>/dev/null; then
+  command -v python3 >/dev/null || { echo "python3 not found: the checks from Python are skipped"; return 1; }
+  if [ -x "$venv/bin/python" ] && "$venv/bin/python" -c 'import onnx, onnxruntime, numpy, PIL, mcap, jsonschema, foxglove_schemas_protobuf, pybag' 2>/dev/null; then
     return 0
   fi
   mkdir -p "$target"

@@ -144,8 +144,11 @@ fn limits_of_a_thermal_camera_follow_without_allocating() {
     use tsda_runtime::{BBox, FrameView, PixelFormat};
     let layout = Profile::Lepton.layout(160, 122, true, u16::MAX).expect("layout");
     let mut thermal = Thermal::new(layout, AgcOptions::default()).expect("thermal");
-    let data: Vec<u8> =
-        (0..160 * 122).flat_map(|i: u32| (29_000 + (i % 900) as u16).to_le_bytes()).collect();
+    // Words 208 and 209 of the telemetry: raw values are temperatures, of 0.01 K.
+    let said = |i: u32| matches!(i.checked_sub(160 * 120), Some(208 | 209));
+    let data: Vec<u8> = (0..160 * 122)
+        .flat_map(|i: u32| if said(i) { 1u16 } else { 29_000 + (i % 900) as u16 }.to_le_bytes())
+        .collect();
     let format = PixelFormat::Y16 { low: 0, high: u16::MAX };
     let view = FrameView::new(&data, 160, 122, 320, format).expect("view");
     let before = COUNT.get();

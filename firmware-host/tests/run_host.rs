@@ -181,14 +181,42 @@ fn temperatures_are_reported_by_cameras_that_measure_them() {
     let dir = tempfile::tempdir().expect("temp");
     let config = "clock = \"frames\"\nframes = 3\n[[source]]\nname = \"t\"\nsensor = \"thermal\"\n\
                   profile = \"lepton\"\nrender = { size = [160, 120], raw16 = true }\n\
-                  [[output.json]]\nto = \"stdout\"\n";
-    let output = tsda(dir.path(), config, &[]);
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    for frame in lines(&output).iter().filter(|v| v["type"] == "frame") {
+                  CELSIUS\n[[output.json]]\nto = \"stdout\"\n";
+    let frames = |celsius: &str| {
+        let output = tsda(dir.path(), &config.replace("CELSIUS", celsius), &[]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        lines(&output).into_iter().filter(|v| v["type"] == "frame").collect::<Vec<_>>()
+    };
+    // No telemetry says so, nor does anybody else.
+    assert!(frames("").iter().all(|f| f["celsius"].is_null()));
+    let measured = frames("celsius = { scale = 0.01, offset = -273.15 }");
+    assert_eq!(measured.len(), 3);
+    for frame in measured {
         let mean = frame["celsius"]["mean"].as_f64().expect("measured");
         let max = frame["celsius"]["max"].as_f64().expect("measured");
         assert!((20.0..40.5).contains(&mean) && max >= mean && max < 40.5, "{frame}");
     }
+}
+
+#[test]
+fn recordings_are_read_by_other_peoples_software() {
+    let python = std::env::var("TSDA_PYTHON").unwrap_or_else(|_| "python3".into());
+    let packages = "import mcap, jsonschema, foxglove_schemas_protobuf";
+    let have = Command::new(&python).args(["-c", packages]).output();
+    if !have.is_ok_and(|o| o.status.success()) {
+        println!("skipped: {python} has not all of mcap, jsonschema, foxglove-schemas-protobuf");
+        return;
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../scripts/mcap_check.py");
+    let checked = Command::new(&python)
+        .arg(script)
+        .args(["--tsda", env!("CARGO_BIN_EXE_tsda")])
+        .output()
+        .expect("runs");
+    let said = String::from_utf8_lossy(&checked.stdout);
+    println!("{said}");
+    assert!(checked.status.success(), "{said}{}", String::from_utf8_lossy(&checked.stderr));
+    assert!(said.contains("recovered: "), "{said}");
 }
 
 #[test]

@@ -8,6 +8,8 @@ ok() { echo "ok: $*"; }
 config() {
   profile=
   [ -z "${PROFILE:-}" ] || profile="profile = \"$PROFILE\""
+  [ -z "${SCALE:-}" ] || profile="$profile
+celsius = { scale = $SCALE, offset = -273.15 }"
   cat >/tmp/$1.toml <<C
 give_up_s = ${GIVE_UP:-30}
 [[source]]
@@ -51,5 +53,12 @@ lines() { wc -l </out/$1.jsonl; }
 goes_on() { from=$2; [ "$(good $1 $from)" -ge "${3:-5}" ]; }
 # figure NAME WORD: the number before WORD in the line of the first source, at the end of a run
 figure() { sed -n "s/.*source [a-z]*: .*[ ,]\([0-9][0-9]*\) $2.*/\1/p" /out/$1.err | head -1; }
+# settled NAME WHAT FRAME: the loop allocated nothing from that frame on
+settled() {
+  loop=$(sed -n 's/^loop: \([0-9]*\) allocations.*/\1/p' /out/$1.err)
+  last=$(sed -n 's/^loop: .*the last in frame \([0-9]*\)$/\1/p' /out/$1.err)
+  [ -n "$loop" ] && [ "${last:-0}" -lt $3 ] && ok "$2: $loop allocations, the last in frame ${last:-none}, of $(frames $1)" ||
+    fail "$2: $(grep '^loop:' /out/$1.err || echo 'no figure')"
+}
 ready() { until_true 20 sh -c "/bin/probe caps $1 >/dev/null 2>&1" || fail "no camera at $1"; }
 no_panic() { if grep -l panicked /out/*.err; then fail "panic"; fi; }

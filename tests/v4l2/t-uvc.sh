@@ -13,10 +13,13 @@ warm() {
 counted() { [ "$(figure $1 $3)" -ge 1 ] && ok "$2: $(figure $1 $3) $3" || fail "$2: no $3: $(tail -2 /out/$1.err)"; }
 export SENSOR=thermal
 play purethermal --fps 9 --ffc-every 40 --ffc-frames 6
-for size in 160x120 160x122; do
-  PROFILE=lepton config lepton$size /dev/video0 Y16 $size; run lepton$size --frames 20; rc=$?
-  warm lepton$size "PureThermal $size"
-done
+PROFILE=lepton config lepton160x122 /dev/video0 Y16 160x122; run lepton160x122 --frames 20; rc=$?
+warm lepton160x122 "PureThermal 160x122"
+# Without telemetry nobody says that raw values are temperatures, but for the configuration.
+PROFILE=lepton config lepton160x120 /dev/video0 Y16 160x120; run lepton160x120 --frames 5; rc=$?
+[ $rc = 0 ] && ! has lepton160x120 celsius && ok "PureThermal 160x120: no temperature" || fail "PureThermal 160x120: exit $rc, a temperature that nobody stands for"
+PROFILE=lepton SCALE=0.01 config stated /dev/video0 Y16 160x120; run stated --frames 20; rc=$?
+warm stated "PureThermal 160x120 with its scale"
 # The telemetry rows say when the shutter is closed.
 begin lepton160x122
 until_true 30 has lepton160x122 '"camera_lost","source":"cam","reason":"shutter"' && ok "shutter: seen" || fail "shutter: not seen: $(tail -2 /out/lepton160x122.err)"
@@ -31,6 +34,10 @@ config grey /dev/video0 GREY 160x120; run grey --frames 10; rc=$?
 # Asked for what this camera does not have.
 PROFILE=lepton config size /dev/video0 Y16 80x63; run size --frames 5; rc=$?
 [ $rc = 2 ] && grep -q "asked for 80 x 63" /out/size.err && ok "wrong size: exit 2" || fail "wrong size: exit $rc: $(tail -1 /out/size.err)"
+unplug
+play purethermal --fps 9 --tlinear 0
+PROFILE=lepton config counts /dev/video0 Y16 160x122; run counts --frames 5; rc=$?
+[ $rc = 0 ] && ! has counts celsius && ok "PureThermal without TLinear: no temperature" || fail "PureThermal without TLinear: exit $rc, or a temperature"
 unplug
 play boson --fps 9
 for size in 640x512 640x514; do

@@ -10,10 +10,15 @@ for f in YUYV UYVY NV12 RGB3 BGR3 GREY Y16 Y10; do
   run $f --frames 30; rc=$?
   if [ $rc = 0 ] && [ "$(frames $f)" = 30 ] && [ "$(good $f 0)" = 30 ] && ! has $f '"predicted":true'; then
     ok "$f: $(tail -1 /out/$f.err)"
+    settled $f "$f: the loop" 10
   else
     fail "$f: exit $rc, $(frames $f) frames, $(good $f 0) good: $(tail -3 /out/$f.err)"
   fi
 done
+# In the long run too, with the driver's buffers going round many times.
+PATIENT=y config long $D YUYV 640x480 "rate = 30.0"; run long --frames 200; rc=$?
+[ $rc = 0 ] || fail "long: exit $rc: $(tail -2 /out/long.err)"
+settled long "the loop on a driver" 10
 # What cannot be is refused before anything runs.
 # refused NAME WHAT PATTERN: exit 2 and the reason
 refused() { run $1 --frames 5; rc=$?; [ $rc = 2 ] && grep -q "$3" /out/$1.err && ok "$2: exit 2" || fail "$2: exit $rc: $(tail -2 /out/$1.err)"; }

@@ -5,6 +5,7 @@ use crate::error::{EXIT_NO_PICTURES, EXIT_OK, HostError};
 use crate::host::control;
 use crate::host::outputs;
 use crate::host::plan::Plan;
+use crate::host::sys;
 use crate::host::{Ending, Host, HostConfig, SourceInfo};
 use crate::model;
 use crate::redetect::RedetectArgs;
@@ -30,6 +31,8 @@ pub struct RunArgs {
 }
 
 pub(super) fn run(args: &RunArgs) -> Result<u8, HostError> {
+    // Before there are other threads.
+    sys::share_heaps();
     let config = HostConfig::read(&args.config)?;
     let mut plan = Plan::new(&config)?;
     plan.frames = args.frames.or(plan.frames);

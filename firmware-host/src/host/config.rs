@@ -14,7 +14,7 @@ use crate::error::HostError;
 use crate::switch::HealthLimits;
 use crate::switch::homography::Homography;
 use crate::switch::policy::SceneMeasure;
-use crate::thermal::{AgcOptions, Profile};
+use crate::thermal::{AgcOptions, Celsius, Profile};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -84,6 +84,8 @@ pub struct SourceConfig {
     pub render: Option<RenderConfig>,
     /// What a thermal camera's buffer holds.
     pub profile: Option<Profile>,
+    /// What raw values mean, instead of what the profile or the telemetry says.
+    pub celsius: Option<Celsius>,
     /// 16 bit to 8 bit.
     #[serde(default)]
     pub agc: AgcOptions,

@@ -67,6 +67,7 @@ pub struct Metrics {
     switches: [AtomicU64; REASONS.len()],
     selected: AtomicU64,
     refused: AtomicU64,
+    allocations: AtomicU64,
     zones: Option<Arc<Zones>>,
     outputs: OnceLock<Vec<(String, Losses)>>,
 }
@@ -106,6 +107,7 @@ impl Metrics {
             switches: Default::default(),
             selected: AtomicU64::default(),
             refused: AtomicU64::default(),
+            allocations: AtomicU64::default(),
             zones,
             outputs: OnceLock::new(),
         }
@@ -138,6 +140,7 @@ impl Metrics {
         };
         self.state.store(state, Ordering::Relaxed);
         self.active.store(record.source as u64, Ordering::Relaxed);
+        self.allocations.fetch_add(record.allocations, Ordering::Relaxed);
         put(&self.score, target.map_or(f32::NAN, |t| t.score));
         put(&self.confidence, target.and_then(|t| t.confidence).unwrap_or(f32::NAN));
         let now = self.start.elapsed().as_micros() as u64;
@@ -237,6 +240,12 @@ impl Metrics {
             get(&self.refused) as f64,
         );
         self.latency_text(&mut out);
+        out.one(
+            "tsda_loop_allocations_total",
+            "counter",
+            "Allocations of the loop's thread.",
+            get(&self.allocations) as f64,
+        );
         if let Some(outputs) = self.outputs.get() {
             out.head("tsda_output_dropped_total", "counter", "Items an output lost.");
             for (name, losses) in outputs {
@@ -438,6 +447,7 @@ mod tests {
             latency: Duration::from_millis(millis),
             tracking: Duration::ZERO,
             skipped: 0,
+            allocations: 0,
         }
     }
 

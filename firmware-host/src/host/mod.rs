@@ -31,14 +31,14 @@ pub mod sensor;
 pub mod shot;
 pub mod source;
 #[allow(unsafe_code)]
-mod sys;
+pub(crate) mod sys;
 pub mod zones;
 
 pub use clock::Clock;
 pub use config::HostConfig;
 pub use control::Command;
 pub use output::{Event, EventKind, FrameRecord, Output, SourceInfo, TargetRecord, Views};
-pub use run::{Ending, Host, Summary};
+pub use run::{Allocations, Ending, Host, Summary};
 
 #[cfg(test)]
 mod tests;

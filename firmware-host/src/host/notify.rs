@@ -109,6 +109,7 @@ mod tests {
             latency: Duration::ZERO,
             tracking: Duration::ZERO,
             skipped: 0,
+            allocations: 0,
         }
     }
 

@@ -65,6 +65,8 @@ pub struct FrameRecord {
     pub tracking: Duration,
     /// Older pictures of this source passed over since the last record.
     pub skipped: u32,
+    /// Allocations of the loop's thread since the last record; 0 also where nothing counts them.
+    pub allocations: u64,
 }
 
 /// Something that happens now and then.

@@ -240,6 +240,11 @@ fn sensor(config: &HostConfig, source: &SourceConfig) -> Result<Sensor, HostErro
     if source.crop.is_some_and(|c| c[2] == 0 || c[3] == 0) {
         return refuse(key(".crop"), "x, y, width, height: width and height of at least 1");
     }
+    if let Some(c) = &source.celsius
+        && !(c.scale.is_finite() && c.scale > 0.0 && c.offset.is_finite())
+    {
+        return refuse(key(".celsius"), "scale has to be above 0: kelvin per raw step");
+    }
     let health = &source.health;
     for (name, value) in [("timeout_s", health.timeout_s), ("frozen_s", health.frozen_s)] {
         seconds(&key(&format!(".health.{name}")), value)?;
@@ -250,7 +255,8 @@ fn sensor(config: &HostConfig, source: &SourceConfig) -> Result<Sensor, HostErro
         Box::new(open_reel(config, source)?.with_faults(source.faults.clone()))
     };
     let info = SourceInfo { name: source.name.clone(), sensor: source.sensor };
-    Sensor::new(info, opened, source.profile, source.agc, *health, source.crop)
+    let meaning = (source.profile, source.celsius);
+    Sensor::new(info, opened, meaning, source.agc, *health, source.crop)
 }
 
 #[cfg(feature = "camera")]

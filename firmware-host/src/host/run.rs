@@ -16,6 +16,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
+use tsda_runtime::system::allocations_here;
 use tsda_runtime::{BBox, Engine, TrackError, TrackState, Tracker};
 
 /// Longest wait for a picture: how soon commands, signals and other sensors are looked at.
@@ -51,6 +52,16 @@ impl Ending {
     }
 }
 
+/// Allocations of the loop's thread, from its first turn on. What depends on the sensors is set up in
+/// their first frames; from then on there should be none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Allocations {
+    /// All of them; 0 also where nothing counts them.
+    pub count: u64,
+    /// Record that the last was made for.
+    pub last: Option<u64>,
+}
+
 /// Figures of a run.
 #[derive(Clone, Debug)]
 pub struct Summary {
@@ -66,6 +77,8 @@ pub struct Summary {
     pub time: Duration,
     /// Mean and largest latency of tracked frames.
     pub latency: (Duration, Duration),
+    /// Of the loop's thread.
+    pub allocations: Allocations,
     /// Name and counts of every source.
     pub sources: Vec<(String, Counters)>,
     /// Name of every output and what it lost.
@@ -87,6 +100,12 @@ impl fmt::Display for Summary {
             ms(self.latency.0),
             ms(self.latency.1)
         )?;
+        let Allocations { count, last } = self.allocations;
+        write!(f, "loop: {count} allocations")?;
+        match last {
+            Some(frame) => writeln!(f, ", the last in frame {frame}")?,
+            None => writeln!(f)?,
+        }
         for (name, c) in &self.sources {
             writeln!(
                 f,
@@ -135,6 +154,9 @@ pub struct Host<E> {
     switches: u64,
     tracked: u64,
     latency: (Duration, Duration),
+    /// Of this thread, up to the last record.
+    allocated: u64,
+    allocations: Allocations,
 }
 
 impl<E: Engine> Host<E> {
@@ -173,6 +195,8 @@ impl<E: Engine> Host<E> {
             switches: 0,
             tracked: 0,
             latency: (Duration::ZERO, Duration::ZERO),
+            allocated: 0,
+            allocations: Allocations::default(),
         }
     }
 
@@ -218,6 +242,7 @@ impl<E: Engine> Host<E> {
             *start = Instant::now();
         }
         self.event(EventKind::Started);
+        self.allocated = allocations_here();
     }
 
     /// Lets the time go on by a frame, where it goes by frames.
@@ -412,6 +437,7 @@ impl<E: Engine> Host<E> {
             latency: taken.map_or(arrived, |t| t.min(arrived)).elapsed(),
             tracking,
             skipped: skipped.min(u64::from(u32::MAX)) as u32,
+            allocations: self.count_allocations(),
         };
         let views = Views(&self.sensors);
         for output in &mut self.outputs {
@@ -426,6 +452,17 @@ impl<E: Engine> Host<E> {
             self.predicted += 1;
         }
         Ok(())
+    }
+
+    /// How many there were since the last call, from the first turn on.
+    fn count_allocations(&mut self) -> u64 {
+        let now = allocations_here();
+        let new = now - std::mem::replace(&mut self.allocated, now);
+        if new > 0 {
+            self.allocations.count += new;
+            self.allocations.last = Some(self.record);
+        }
+        new
     }
 
     fn take_pending(&mut self, now: Duration) {
@@ -536,6 +573,7 @@ impl<E: Engine> Host<E> {
             switches: self.switches,
             time: self.clock.now(),
             latency: (mean.unwrap_or_default(), self.latency.1),
+            allocations: self.allocations,
             sources: self
                 .sensors
                 .iter()

@@ -6,7 +6,7 @@ use super::source::{Captured, Polled, Source};
 use crate::error::HostError;
 use crate::switch::health::Marks;
 use crate::switch::{Condition, HealthLimits, Scene, Watch};
-use crate::thermal::{AgcOptions, Profile, Temperature, Thermal};
+use crate::thermal::{AgcOptions, Celsius, Profile, Temperature, Thermal};
 use std::time::Duration;
 use tsda_runtime::{BBox, FrameView, Modality, PixelFormat};
 
@@ -15,7 +15,8 @@ use tsda_runtime::{BBox, FrameView, Modality, PixelFormat};
 pub struct Sensor {
     info: SourceInfo,
     source: Box<dyn Source>,
-    profile: Option<Profile>,
+    /// What buffers and raw values are, where it is given.
+    meaning: (Option<Profile>, Option<Celsius>),
     agc: AgcOptions,
     crop: Option<[usize; 4]>,
     /// Width, height, 16 bit, largest value: what `thermal` was made for.
@@ -39,14 +40,15 @@ pub enum News {
 }
 
 impl Sensor {
-    /// Puts a sensor together.
+    /// Puts a sensor together. `meaning`: what its buffers hold, and the scale of raw values where it
+    /// is given.
     ///
     /// # Errors
     /// When the gain options make no sense.
     pub fn new(
         info: SourceInfo,
         source: Box<dyn Source>,
-        profile: Option<Profile>,
+        meaning: (Option<Profile>, Option<Celsius>),
         agc: AgcOptions,
         health: HealthLimits,
         crop: Option<[usize; 4]>,
@@ -63,7 +65,7 @@ impl Sensor {
         Ok(Self {
             info,
             source,
-            profile,
+            meaning,
             agc,
             crop,
             shape: None,
@@ -132,12 +134,13 @@ impl Sensor {
         let sixteen = matches!(whole.format(), PixelFormat::Y16 { .. });
         let shape = (whole.width(), whole.height(), sixteen, captured.full);
         if self.shape != Some(shape) {
-            self.thermal = match self.profile {
-                None if !sixteen => None,
-                profile => {
+            self.thermal = match self.meaning {
+                (None, _) if !sixteen => None,
+                (profile, celsius) => {
                     let layout = profile
                         .unwrap_or_default()
                         .layout(shape.0, shape.1, sixteen, captured.full)
+                        .map(|layout| layout.with_celsius(celsius))
                         .and_then(|layout| Thermal::new(layout, self.agc));
                     Some(layout.map_err(|e| fail(&self.info.name, e.to_string()))?)
                 }

@@ -4,6 +4,7 @@
 
 use std::io;
 use std::os::fd::AsRawFd;
+use std::time::Duration;
 
 /// Keeps all memory of the process in RAM, also what it gets later.
 ///
@@ -46,8 +47,18 @@ pub fn real_time(_: u8) -> io::Result<()> {
     Err(io::ErrorKind::Unsupported.into())
 }
 
-/// Sets a serial line to raw bytes at a speed, eight bits, no parity; reads answer after a tenth of a
-/// second at the latest.
+/// Lets all threads share two heaps. By default a thread that finds the others' heaps busy gets one of
+/// its own, up to eight per core, each of which keeps what it once needed: with a thread per output and
+/// per connection, memory grows for hours though nothing leaks. For the start of a program; on other
+/// systems than Linux with glibc there is nothing to do.
+pub fn share_heaps() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: takes only numbers, and allocators may be told at any time.
+    // What it answers does not matter: the default is only larger.
+    let _ = unsafe { libc::mallopt(libc::M_ARENA_MAX, 2) };
+}
+
+/// Sets a serial line to raw bytes at a speed, eight bits, no parity.
 ///
 /// # Errors
 /// When it is no serial line or does not know the speed.
@@ -74,11 +85,39 @@ pub fn serial(line: &impl AsRawFd, baud: u32) -> io::Result<()> {
     unsafe { libc::cfmakeraw(&raw mut settings) };
     settings.c_cflag |= libc::CLOCAL | libc::CREAD;
     settings.c_cc[libc::VMIN] = 0;
-    settings.c_cc[libc::VTIME] = 1;
+    settings.c_cc[libc::VTIME] = 0;
     // SAFETY: as above.
     check(unsafe { libc::cfsetspeed(&raw mut settings, speed) })?;
     // SAFETY: as above.
     check(unsafe { libc::tcsetattr(fd, libc::TCSANOW, &raw const settings) })
+}
+
+/// Waits for bytes; answers whether there are any.
+///
+/// # Errors
+/// `BrokenPipe` when the other end is gone and nothing is left to be read.
+pub fn readable(line: &impl AsRawFd, patience: Duration) -> io::Result<bool> {
+    let mut asked = libc::pollfd { fd: line.as_raw_fd(), events: libc::POLLIN, revents: 0 };
+    let millis = i32::try_from(patience.as_millis()).unwrap_or(i32::MAX);
+    // SAFETY: one structure that is alive, of a descriptor that is borrowed.
+    match unsafe { libc::poll(&raw mut asked, 1, millis) } {
+        -1 => Err(io::Error::last_os_error()),
+        0 => Ok(false),
+        _ if asked.revents & libc::POLLIN != 0 => Ok(true),
+        _ => Err(io::ErrorKind::BrokenPipe.into()),
+    }
+}
+
+/// Our end of a pseudo-terminal, and the name of the end that is to be taken for a serial line.
+#[cfg(all(test, target_os = "linux"))]
+pub fn pseudo_terminal() -> io::Result<(std::fs::File, std::path::PathBuf)> {
+    let ours = std::fs::OpenOptions::new().read(true).write(true).open("/dev/ptmx")?;
+    let (fd, mut number, locked) = (ours.as_raw_fd(), 0u32, 0i32);
+    // SAFETY: the descriptor is alive, and so are the numbers that the two requests read and write.
+    check(unsafe { libc::ioctl(fd, libc::TIOCSPTLCK, &raw const locked) })?;
+    // SAFETY: as above.
+    check(unsafe { libc::ioctl(fd, libc::TIOCGPTN, &raw mut number) })?;
+    Ok((ours, format!("/dev/pts/{number}").into()))
 }
 
 fn check(answer: i32) -> io::Result<()> {

@@ -9,9 +9,9 @@ pub mod agc;
 pub mod profile;
 
 pub use agc::{Agc, AgcOptions, Window};
-pub use profile::{Layout, Profile, ThermalError};
+pub use profile::{Celsius, Layout, Profile, ThermalError};
 
-use profile::{Picture, Telemetry};
+use profile::{Measured, Picture, Telemetry};
 use std::time::Duration;
 use tsda_runtime::{BBox, FrameError, FrameView, PixelFormat};
 
@@ -87,9 +87,13 @@ impl Thermal {
         rows(whole, self.layout.rows, format)
     }
 
-    /// Temperature at the target; `None` when the camera does not measure any.
+    /// Temperature at the target; `None` when the camera does not measure any, or does not say that it
+    /// does.
     pub fn temperature(&self, whole: &FrameView<'_>, bbox: &BBox) -> Option<Temperature> {
-        let celsius = self.layout.celsius?;
+        let celsius = match self.layout.measured {
+            Measured::Always => self.layout.celsius?,
+            Measured::WhenSaid => self.said(whole)?,
+        };
         let raw = PixelFormat::Y16 { low: 0, high: u16::MAX };
         let data = rows(whole, self.layout.data?, raw).ok()?;
         // The picture and the temperatures may differ in size.
@@ -122,18 +126,29 @@ impl Thermal {
 
     /// What the telemetry rows say; nothing when there are none. Allocates nothing.
     pub fn status(&self, whole: &FrameView<'_>) -> Status {
-        let Some((at, Telemetry::Lepton)) = self.layout.telemetry else {
-            return Status::default();
-        };
-        let start = at.first * whole.stride();
-        let word = |i: usize| {
-            let bytes = whole.data().get(start + 2 * i..start + 2 * i + 2)?;
-            Some(u32::from(u16::from_le_bytes([bytes[0], bytes[1]])))
-        };
+        let word = |i: usize| self.word(whole, i);
         let long = |i: usize| Some(word(i)? | word(i + 1)? << 16);
         // Bits 4 and 5 of the status: 1 imminent, 2 in progress, 3 complete.
         let ffc = long(profile::LEPTON_STATUS).map_or(0, |s| s >> 4 & 3);
         Status { shutter: ffc == 2, counter: long(profile::LEPTON_COUNTER) }
+    }
+
+    /// The scale of the raw values as the telemetry tells it.
+    fn said(&self, whole: &FrameView<'_>) -> Option<Celsius> {
+        let word = |i: usize| self.word(whole, profile::LEPTON_TLINEAR + i);
+        profile::tlinear(word(0)?, word(1)?)
+    }
+
+    /// A word of a Lepton's telemetry.
+    fn word(&self, whole: &FrameView<'_>, i: usize) -> Option<u32> {
+        let Some((at, Telemetry::Lepton)) = self.layout.telemetry else { return None };
+        let (row, column) = (i / self.layout.width, i % self.layout.width);
+        if row >= at.count {
+            return None;
+        }
+        let start = (at.first + row) * whole.stride() + 2 * column;
+        let bytes = whole.data().get(start..start + 2)?;
+        Some(u32::from(u16::from_le_bytes([bytes[0], bytes[1]])))
     }
 }
 

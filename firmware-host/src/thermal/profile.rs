@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 /// Telemetry words of a Lepton (16 bit, low word of two first).
 pub(super) const LEPTON_STATUS: usize = 3;
 pub(super) const LEPTON_COUNTER: usize = 20;
+/// Words 48 and 49 of the third group of 80: whether raw values are temperatures, and in which steps
+/// (0: 0.1 K, 1: 0.01 K).
+pub(super) const LEPTON_TLINEAR: usize = 160 + 48;
 
 /// A kind of thermal camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -14,8 +17,8 @@ pub enum Profile {
     /// 16-bit words without further meaning.
     #[default]
     Generic,
-    /// FLIR Lepton 2, 3 (PureThermal boards), with TLinear at 0.01 K; telemetry rows are recognised
-    /// by the number of rows.
+    /// FLIR Lepton 2, 3 (PureThermal boards); telemetry rows are recognised by the number of rows, and
+    /// say whether raw values are temperatures (TLinear). Gain takes them for 0.01 K.
     Lepton,
     /// FLIR Boson: counts before its gain control; telemetry rows are recognised by the number of
     /// rows.
@@ -45,7 +48,7 @@ pub enum Picture {
 /// What the rows of telemetry are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Telemetry {
-    /// Read: shutter and frame counter.
+    /// Read: shutter, frame counter, scale of temperatures.
     Lepton,
     /// Passed over.
     Unread,
@@ -74,6 +77,15 @@ impl Celsius {
     }
 }
 
+/// Which temperatures are reported.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Measured {
+    /// Those of [`Layout::celsius`], as the camera's only way or by the configuration.
+    Always,
+    /// Those of pictures whose telemetry says that raw values are temperatures, in its scale.
+    WhenSaid,
+}
+
 /// Where things are in a buffer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Layout {
@@ -87,8 +99,10 @@ pub struct Layout {
     pub data: Option<Rows>,
     /// Rows of telemetry.
     pub telemetry: Option<(Rows, Telemetry)>,
-    /// Meaning of the words in `data`.
+    /// Meaning of the words in `data`, as far as gain is concerned.
     pub celsius: Option<Celsius>,
+    /// Whether `celsius` is also reported.
+    pub measured: Measured,
     /// Largest value of a word: what the sensor can deliver.
     pub full: u16,
 }
@@ -124,7 +138,32 @@ pub enum ThermalError {
     },
 }
 
-const CENTIKELVIN: Celsius = Celsius { scale: 0.01, offset: -273.15 };
+/// Zero in degrees Celsius of scales that begin at absolute zero.
+const ABSOLUTE: f64 = -273.15;
+const CENTIKELVIN: Celsius = Celsius { scale: 0.01, offset: ABSOLUTE };
+const DECIKELVIN: Celsius = Celsius { scale: 0.1, offset: ABSOLUTE };
+
+/// The scale that the words at [`LEPTON_TLINEAR`] tell; `None` when raw values are no temperatures.
+pub(super) const fn tlinear(on: u32, resolution: u32) -> Option<Celsius> {
+    match (on, resolution) {
+        (1, 0) => Some(DECIKELVIN),
+        (1, 1) => Some(CENTIKELVIN),
+        _ => None,
+    }
+}
+
+impl Layout {
+    /// With a scale that somebody stands for; only where there are raw values.
+    #[must_use]
+    pub fn with_celsius(self, celsius: Option<Celsius>) -> Self {
+        match celsius {
+            Some(_) if self.data.is_some() => {
+                Self { celsius, measured: Measured::Always, ..self }
+            }
+            _ => self,
+        }
+    }
+}
 
 impl Profile {
     /// Where things are in a buffer of this size. `sixteen`: the buffer holds 16-bit words (and not
@@ -153,6 +192,7 @@ impl Profile {
             data: sixteen.then_some(Rows { first: 0, count: picture_rows }),
             telemetry: None,
             celsius: None,
+            measured: Measured::Always,
             full,
         };
         let under = |rows: usize, kind| {
@@ -168,6 +208,7 @@ impl Profile {
                 };
                 let mut layout = simple(rows);
                 layout.celsius = sixteen.then_some(CENTIKELVIN);
+                layout.measured = Measured::WhenSaid;
                 // The rows are 16-bit words; an 8-bit buffer has no room for them.
                 layout.telemetry = under(rows, Telemetry::Lepton).filter(|_| sixteen);
                 Ok(layout)
@@ -193,7 +234,7 @@ impl Profile {
                     rows: Rows { first: if sixteen { 192 } else { 0 }, count: 192 },
                     data: Some(Rows { first: 192, count: 192 }),
                     telemetry: under(384, Telemetry::Unread),
-                    celsius: Some(Celsius { scale: 1.0 / 64.0, offset: -273.15 }),
+                    celsius: Some(Celsius { scale: 1.0 / 64.0, offset: ABSOLUTE }),
                     ..simple(192)
                 })
             }

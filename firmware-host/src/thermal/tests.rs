@@ -99,6 +99,44 @@ fn the_lepton_says_when_its_shutter_is_closed() {
 }
 
 #[test]
+fn the_lepton_says_whether_it_measures_temperatures() {
+    let celsius = Some(Celsius { scale: 0.1, offset: -273.15 });
+    for (width, rows, height) in [(160, 120, 122), (80, 60, 63)] {
+        let plain = Profile::Lepton.layout(width, height, true, u16::MAX).expect("layout");
+        let stated = plain.with_celsius(celsius);
+        let mut values = vec![2_981u16; width * height];
+        // on, resolution; degrees by the telemetry
+        for (on, resolution, degrees) in
+            [(0, 0, None), (0, 1, None), (1, 0, Some(24.95)), (1, 1, Some(-243.34)), (7, 1, None)]
+        {
+            values[width * rows + 208] = on;
+            values[width * rows + 209] = resolution;
+            let data = bytes(&values);
+            let measure = |layout| {
+                let thermal = Thermal::new(layout, AgcOptions::default()).expect("thermal");
+                let at = BBox::new(20.0, 20.0, 10.0, 10.0);
+                thermal.temperature(&y16(&data, width, height), &at).map(|t| t.mean)
+            };
+            let got = measure(plain);
+            assert_eq!(got.is_some(), degrees.is_some(), "{width}: {on} {resolution}");
+            assert!(
+                got.zip(degrees).is_none_or(|(a, b): (f32, f32)| (a - b).abs() < 0.01),
+                "{width}: {on} {resolution}: {got:?}"
+            );
+            let by_hand = measure(stated).expect("stated");
+            assert!((by_hand - 24.95).abs() < 0.01, "{width}: {on} {resolution}: {by_hand}");
+        }
+        // Nobody says it without telemetry.
+        let bare = Profile::Lepton.layout(width, rows, true, u16::MAX).expect("layout");
+        let thermal = Thermal::new(bare, AgcOptions::default()).expect("thermal");
+        let data = bytes(&values[..width * rows]);
+        assert_eq!(thermal.temperature(&y16(&data, width, rows), &BBox::new(9.0, 9.0, 9.0, 9.0)), None);
+        let grey = Profile::Lepton.layout(width, rows, false, 255).expect("layout");
+        assert_eq!(grey.with_celsius(celsius), grey, "8 bits are no temperatures");
+    }
+}
+
+#[test]
 fn limits_follow_slowly_and_stand_still_behind_the_shutter() {
     let layout = Profile::Lepton.layout(160, 122, true, u16::MAX).expect("layout");
     let mut thermal = Thermal::new(layout, AgcOptions::default()).expect("thermal");

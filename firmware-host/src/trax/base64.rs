@@ -72,15 +72,21 @@ pub fn decode(text: &str) -> Result<Vec<u8>, Base64Error> {
 
 /// Encodes bytes, with padding.
 pub fn encode(bytes: &[u8]) -> String {
-    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    let mut out = Vec::new();
+    encode_into(bytes, &mut out);
+    out.into_iter().map(char::from).collect()
+}
+
+/// Encodes bytes, with padding, to the end of `out`.
+pub fn encode_into(bytes: &[u8], out: &mut Vec<u8>) {
+    out.reserve(bytes.len().div_ceil(3) * 4);
     for chunk in bytes.chunks(3) {
         let mut word = [0; 4];
         word[1..=chunk.len()].copy_from_slice(chunk);
         let word = u32::from_be_bytes(word);
         for i in 0..4 {
             let symbol = ALPHABET[(word >> (18 - 6 * i) & 63) as usize];
-            out.push(if i <= chunk.len() { symbol as char } else { '=' });
+            out.push(if i <= chunk.len() { symbol } else { b'=' });
         }
     }
-    out
 }

@@ -12,7 +12,7 @@ mod map;
 mod pool;
 
 pub use clock::{peak_rss, process_cpu};
-pub use heap::{Counts, Heap, count};
+pub use heap::{Counts, Heap, allocations_here, count};
 pub use map::Mapping;
 #[cfg(feature = "pool")]
 pub use pool::{PoolUsage, growing, is_installed, pool_usage, pooled, reserve};

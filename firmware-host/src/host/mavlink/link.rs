@@ -5,6 +5,7 @@ use crate::error::HostError;
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read as _, Write as _};
 use std::net::{SocketAddr, ToSocketAddrs as _, UdpSocket};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::time::{Duration, Instant};
 
 /// How long a read may take; also how late records are seen.
@@ -13,6 +14,8 @@ const WAIT: Duration = Duration::from_millis(20);
 const STATIONS: usize = 8;
 /// A station that was silent for so long is forgotten.
 const SILENCE: Duration = Duration::from_secs(10);
+/// A serial line that was lost is tried again after so long.
+const RETRY: Duration = Duration::from_millis(500);
 
 /// A line.
 #[derive(Debug)]
@@ -27,7 +30,79 @@ pub enum Link {
         stations: Vec<(SocketAddr, Instant)>,
     },
     /// To an autopilot.
-    Serial(File),
+    Serial(Serial),
+}
+
+/// A serial line, which may be pulled out and put back.
+#[derive(Debug)]
+pub struct Serial {
+    device: String,
+    baud: u32,
+    line: Option<File>,
+    /// When it was last tried to be opened.
+    tried: Instant,
+}
+
+impl Serial {
+    fn open(device: &str, baud: u32) -> io::Result<Self> {
+        let line = Some(open_line(device, baud)?);
+        Ok(Self { device: device.to_owned(), baud, line, tried: Instant::now() })
+    }
+
+    /// The line, opened again where it was lost.
+    fn line(&mut self) -> Option<&mut File> {
+        if self.line.is_none() && self.tried.elapsed() >= RETRY {
+            self.tried = Instant::now();
+            self.line = open_line(&self.device, self.baud).ok();
+            if self.line.is_some() {
+                let _ = writeln!(io::stderr(), "tsda: mavlink: {} is back", self.device);
+            }
+        }
+        self.line.as_mut()
+    }
+
+    /// Says once that the line is gone.
+    fn lose(&mut self, why: &io::Error) {
+        if self.line.take().is_some() {
+            let device = &self.device;
+            let _ = writeln!(io::stderr(), "tsda: warning: mavlink: {device} is gone: {why}");
+            self.tried = Instant::now();
+        }
+    }
+
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let Some(line) = self.line() else { return Err(ErrorKind::NotConnected.into()) };
+        let got = match sys::readable(line, WAIT) {
+            Ok(false) => return Err(ErrorKind::WouldBlock.into()),
+            // Ready without a byte: hung up.
+            Ok(true) => match line.read(buffer) {
+                Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
+                got => got,
+            },
+            Err(e) => Err(e),
+        };
+        if let Err(e) = &got
+            && !is_quiet(e)
+        {
+            self.lose(e);
+        }
+        got
+    }
+
+    fn send(&mut self, frame: &[u8]) {
+        // In one go or not at all: it does not wait for a line that is full, and half a frame is
+        // recognised by its checksum.
+        if let Some(Err(e)) = self.line().map(|line| line.write(frame))
+            && !is_quiet(&e)
+        {
+            self.lose(&e);
+        }
+    }
+}
+
+/// Nothing there yet, or no room; not that something is wrong.
+fn is_quiet(e: &io::Error) -> bool {
+    matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
 }
 
 impl Link {
@@ -66,9 +141,7 @@ impl Link {
                     .ok_or_else(|| {
                         refuse("a device and a speed: serial:/dev/ttyTHS1:57600".into())
                     })?;
-                let line = open_line(device).map_err(fail)?;
-                sys::serial(&line, baud).map_err(fail)?;
-                Ok(Self::Serial(line))
+                Serial::open(device, baud).map(Self::Serial).map_err(fail)
             }
             _ => {
                 Err(refuse("none of udp:HOST:PORT, udpin:ADDRESS:PORT, serial:DEVICE:BAUD".into()))
@@ -101,9 +174,8 @@ impl Link {
         match read {
             Ok(n) => n,
             Err(e) => {
-                let quiet = matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut);
                 // Nobody there (refused), a line that was pulled out: not a reason to spin.
-                if !quiet {
+                if !is_quiet(&e) {
                     std::thread::sleep(WAIT);
                 }
                 0
@@ -120,19 +192,15 @@ impl Link {
                     let _ = socket.send_to(frame, *station);
                 }
             }
-            Self::Serial(line) => drop(line.write_all(frame)),
+            Self::Serial(line) => line.send(frame),
         }
     }
 }
 
-#[cfg(target_os = "linux")]
-fn open_line(device: &str) -> io::Result<File> {
-    use std::os::unix::fs::OpenOptionsExt as _;
-    // Not the program's controlling terminal.
-    OpenOptions::new().read(true).write(true).custom_flags(libc::O_NOCTTY).open(device)
-}
-
-#[cfg(not(target_os = "linux"))]
-fn open_line(device: &str) -> io::Result<File> {
-    OpenOptions::new().read(true).write(true).open(device)
+/// Opens a device that is not to become the program's terminal, and never waits.
+fn open_line(device: &str, baud: u32) -> io::Result<File> {
+    let flags = libc::O_NOCTTY | libc::O_NONBLOCK;
+    let line = OpenOptions::new().read(true).write(true).custom_flags(flags).open(device)?;
+    sys::serial(&line, baud)?;
+    Ok(line)
 }

@@ -369,5 +369,7 @@ fn status(record: Option<&FrameRecord>) -> ImageStatus {
     ImageStatus { status, rectangle: Some(corners.map(|v| v.clamp(0.0, 1.0))) }
 }
 
+#[cfg(all(test, target_os = "linux"))]
+mod serial_tests;
 #[cfg(test)]
 mod tests;

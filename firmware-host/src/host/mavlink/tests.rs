@@ -9,14 +9,31 @@ use tsda_runtime::{BBox, Modality};
 const STATION: Sender = Sender { system: 255, component: 190 };
 const US: Sender = Sender { system: 1, component: 100 };
 
-/// A ground station at the other end of a UDP line.
-struct Station {
-    socket: UdpSocket,
+/// A ground station's end of a line.
+pub(super) trait End {
+    fn send(&mut self, bytes: &[u8]);
+    /// Waits for bytes.
+    fn receive(&mut self, bytes: &mut [u8]) -> usize;
+}
+
+impl End for UdpSocket {
+    fn send(&mut self, bytes: &[u8]) {
+        UdpSocket::send(self, bytes).expect("sends");
+    }
+
+    fn receive(&mut self, bytes: &mut [u8]) -> usize {
+        self.recv(bytes).expect("answers")
+    }
+}
+
+/// A ground station at the other end of a line.
+pub(super) struct Station<E> {
+    pub end: E,
     parser: Parser,
     waiting: Vec<Frame>,
 }
 
-impl Station {
+impl Station<UdpSocket> {
     fn new(config: MavlinkConfig) -> (Self, Mavlink, Inbox<Command>) {
         let socket = UdpSocket::bind("127.0.0.1:0").expect("socket");
         socket.set_read_timeout(Some(Duration::from_secs(20))).expect("timeout");
@@ -25,11 +42,17 @@ impl Station {
         let config = MavlinkConfig { to: "udpin:127.0.0.1:0".into(), ..config };
         let output = Mavlink::open(&config, sources, commands).expect("opens");
         socket.connect(output.address().expect("address")).expect("connects");
-        (Self { socket, parser: Parser::default(), waiting: Vec::new() }, output, inbox)
+        (Self::at(socket), output, inbox)
+    }
+}
+
+impl<E: End> Station<E> {
+    pub fn at(end: E) -> Self {
+        Self { end, parser: Parser::default(), waiting: Vec::new() }
     }
 
     /// The next message of a kind; others are passed over.
-    fn next(&mut self, id: u32) -> Frame {
+    pub fn next(&mut self, id: u32) -> Frame {
         loop {
             while !self.waiting.is_empty() {
                 let frame = self.waiting.remove(0);
@@ -39,7 +62,7 @@ impl Station {
                 }
             }
             let mut bytes = [0; 512];
-            let n = self.socket.recv(&mut bytes).expect("answers");
+            let n = self.end.receive(&mut bytes);
             let waiting = &mut self.waiting;
             self.parser.push(&bytes[..n], |f| waiting.push(f));
         }
@@ -52,11 +75,11 @@ impl Station {
         payload.extend([to.system, to.component, 0]);
         let mut frame = Vec::new();
         wire::write_frame(&mut frame, STATION, 0, wire::COMMAND_LONG, &payload);
-        self.socket.send(&frame).expect("sends");
+        self.end.send(&frame);
     }
 
     /// Sends a command and answers its result.
-    fn ask(&mut self, command: u16, params: [f32; 4]) -> u8 {
+    pub fn ask(&mut self, command: u16, params: [f32; 4]) -> u8 {
         self.command(command, params, US);
         let ack = self.next(wire::COMMAND_ACK).payload;
         assert_eq!(u16::from_le_bytes([ack[0], ack[1]]), command);
@@ -65,7 +88,7 @@ impl Station {
     }
 }
 
-fn record(state: Option<TrackState>, predicted: bool) -> FrameRecord {
+pub(super) fn record(state: Option<TrackState>, predicted: bool) -> FrameRecord {
     FrameRecord {
         frame: 1,
         at: Duration::from_secs(1),
@@ -86,6 +109,7 @@ fn record(state: Option<TrackState>, predicted: bool) -> FrameRecord {
         latency: Duration::ZERO,
         tracking: Duration::ZERO,
         skipped: 0,
+        allocations: 0,
     }
 }
 
@@ -163,9 +187,9 @@ fn others_commands_and_noise_are_passed_over() {
     station.command(STOP_TRACKING, [0.0; 4], Sender { system: 2, component: 100 });
     station.command(STOP_TRACKING, [0.0; 4], Sender { system: 1, component: 1 });
     station.command(400, [0.0; 4], Sender { system: 1, component: 0 });
-    station.socket.send(&[0xFD; 300]).expect("sends");
-    station.socket.send(&[0xFD, 255, 0, 0]).expect("sends");
-    station.socket.send(&[0; 300]).expect("sends");
+    End::send(&mut station.end, &[0xFD; 300]);
+    End::send(&mut station.end, &[0xFD, 255, 0, 0]);
+    End::send(&mut station.end, &[0; 300]);
     // The first answer is to the first command that is for us; it is not obeyed here.
     assert_eq!(station.ask(STOP_TRACKING, [0.0; 4]), 2);
     assert!(inbox.try_recv().is_err());

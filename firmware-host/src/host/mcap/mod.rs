@@ -19,7 +19,10 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// A chunk is written out at this size at the latest.
-const CHUNK: usize = 4 << 20;
+const CHUNK: usize = 1 << 20;
+/// A file has at most so many chunks: their index stays in memory until the file ends, about 150 bytes
+/// each.
+const CHUNKS: u32 = 4096;
 /// After a failure a new file is tried so much later.
 const RETRY: Duration = Duration::from_secs(10);
 /// The last chunk has to reach the disk, which may be slow.
@@ -106,6 +109,8 @@ impl Recorder {
             sources,
             encoder: Encoder::new(config.quality, config.size),
             pool,
+            jpeg: Vec::new(),
+            message: Vec::new(),
             origin: None,
             last: None,
         };
@@ -165,6 +170,10 @@ struct Recording {
     sources: Vec<SourceInfo>,
     encoder: Encoder,
     pool: Option<Pool>,
+    /// A picture, and the message it goes into. Kept: large blocks of ever other sizes leave an
+    /// allocator's heap in pieces.
+    jpeg: Vec<u8>,
+    message: Vec<u8>,
     /// Nanoseconds since 1970 at the time 0 of the run.
     origin: Option<u64>,
     /// Source of the last record.
@@ -217,11 +226,12 @@ impl Recording {
                 self.files.message(2 * n + 1, time, line.trim_ascii_end());
             }
             Item::Shot(shot) => {
-                let (time, mut jpeg) = (self.time(shot.record.at), Vec::new());
+                let time = self.time(shot.record.at);
                 for (i, source) in self.sources.iter().enumerate() {
-                    let made = shot.view(i).map(|v| self.encoder.jpeg(&v, &mut jpeg));
+                    let made = shot.view(i).map(|v| self.encoder.jpeg(&v, &mut self.jpeg));
                     if let Some(Ok(_)) = made {
-                        self.files.message(2 * i, time, &schemas::image(time, &source.name, &jpeg));
+                        schemas::image(time, &source.name, &self.jpeg, &mut self.message);
+                        self.files.message(2 * i, time, &self.message);
                     }
                 }
                 if let Some(pool) = &self.pool {
@@ -263,17 +273,17 @@ impl Files {
                     _ => self.begin(),
                 };
             };
-            let full = writer.size() >= self.file_bytes;
+            let full = writer.size() >= self.file_bytes || writer.chunks() >= CHUNKS;
             if full || writer.unflushed() >= CHUNK || self.flushed.elapsed() >= self.flush {
                 writer.flush()?;
                 writer.inner().sync_data()?;
                 self.flushed = Instant::now();
             }
             if full {
-                if let Some(writer) = self.open.take() {
-                    writer.finish()?.sync_data()?;
+                let next = self.create()?;
+                if let Some(writer) = &mut self.open {
+                    writer.next(next)?.sync_data()?;
                 }
-                self.begin()?;
             }
             Ok(())
         })();
@@ -299,20 +309,25 @@ impl Files {
     }
 
     fn begin(&mut self) -> io::Result<()> {
+        let file = self.create()?;
+        self.open = Some(Writer::new(file, &schemas::ALL, &self.topics, CHUNK)?);
+        self.flushed = Instant::now();
+        self.failed = None;
+        Ok(())
+    }
+
+    /// Makes the next file, and room for it.
+    fn create(&mut self) -> io::Result<File> {
         self.make_room()?;
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
         loop {
             let path = self.dir.join(format!("tsda-{}-{:04}.mcap", date(now), self.number));
             match OpenOptions::new().write(true).create_new(true).open(path) {
-                Ok(file) => {
-                    self.number += 1;
-                    self.open = Some(Writer::new(file, &schemas::ALL, &self.topics)?);
-                    self.flushed = Instant::now();
-                    self.failed = None;
-                    return Ok(());
-                }
                 Err(e) if e.kind() == io::ErrorKind::AlreadyExists => self.number += 1,
-                Err(e) => return Err(e),
+                made => {
+                    self.number += u32::from(made.is_ok());
+                    return made;
+                }
             }
         }
     }

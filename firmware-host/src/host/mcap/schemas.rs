@@ -2,7 +2,7 @@
 
 use super::writer::Schema;
 use crate::host::output::{FrameRecord, TargetRecord};
-use crate::trax::encode_base64;
+use crate::trax::encode_base64_into;
 use serde_json::{Value, json};
 use tsda_runtime::TrackState;
 
@@ -30,12 +30,15 @@ fn stamp(nanos: u64) -> Value {
     json!({ "sec": nanos / 1_000_000_000, "nsec": nanos % 1_000_000_000 })
 }
 
-/// A picture.
-pub(super) fn image(time: u64, source: &str, jpeg: &[u8]) -> Vec<u8> {
-    let message = json!({
-        "timestamp": stamp(time), "frame_id": source, "format": "jpeg", "data": encode_base64(jpeg),
-    });
-    message.to_string().into_bytes()
+/// A picture as a message, in place of what `out` holds.
+pub(super) fn image(time: u64, source: &str, jpeg: &[u8], out: &mut Vec<u8>) {
+    let head = json!({ "timestamp": stamp(time), "frame_id": source, "format": "jpeg" }).to_string();
+    out.clear();
+    // The last member goes into the object that is open but for its brace.
+    out.extend_from_slice(head.strip_suffix('}').unwrap_or(&head).as_bytes());
+    out.extend_from_slice(br#","data":""#);
+    encode_base64_into(jpeg, out);
+    out.extend_from_slice(br#""}"#);
 }
 
 /// Box and figures of a record, in pixels of a picture thinned by `step`; nothing without a target.

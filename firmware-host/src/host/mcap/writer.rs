@@ -93,7 +93,8 @@ fn widened(span: Span, time: u64) -> Span {
     span.map_or(Some((time, time)), |(a, b)| Some((a.min(time), b.max(time))))
 }
 
-/// A recording being written.
+/// A recording being written. Its buffers are kept from chunk to chunk and from file to file, so that
+/// memory does not depend on how long a recording goes on.
 #[derive(Debug)]
 pub struct Writer<W> {
     to: W,
@@ -105,36 +106,56 @@ pub struct Writer<W> {
     span: Span,
     /// Per topic: time and place of its messages in the chunk.
     index: Vec<Vec<(u64, u64)>>,
-    /// Content of the summary's chunk indexes.
-    chunks: Vec<Vec<u8>>,
+    /// What stands around the chunk in the file.
+    around: Vec<u8>,
+    /// The summary's chunk indexes, as records.
+    chunk_indexes: Vec<u8>,
+    chunks: u32,
     counts: Vec<u64>,
     whole: Span,
 }
 
 impl<W: Write> Writer<W> {
-    /// Begins a recording.
+    /// Begins a recording. `chunk`: bytes that a chunk is expected to get, at which the caller
+    /// flushes.
     ///
     /// # Errors
     /// When it cannot be written.
-    pub fn new(mut to: W, schemas: &[Schema], topics: &[Topic]) -> io::Result<Self> {
+    pub fn new(to: W, schemas: &[Schema], topics: &[Topic], chunk: usize) -> io::Result<Self> {
+        let mut writer = Self {
+            to,
+            at: 0,
+            declared: declarations(schemas, topics),
+            schemas: schemas.len(),
+            chunk: Vec::with_capacity(chunk),
+            span: None,
+            index: vec![Vec::new(); topics.len()],
+            around: Vec::with_capacity(1024),
+            chunk_indexes: Vec::new(),
+            chunks: 0,
+            counts: vec![0; topics.len()],
+            whole: None,
+        };
+        writer.begin()?;
+        Ok(writer)
+    }
+
+    fn begin(&mut self) -> io::Result<()> {
+        self.at = 0;
+        self.chunk.clear();
+        self.span = None;
+        self.index.iter_mut().for_each(Vec::clear);
+        self.chunk_indexes.clear();
+        self.chunks = 0;
+        self.counts.fill(0);
+        self.whole = None;
         let mut start = MAGIC.to_vec();
         let library = concat!("tsda ", env!("CARGO_PKG_VERSION"));
         record(&mut start, HEADER, &Content::default().text("").text(library).0);
-        let declared = declarations(schemas, topics);
-        start.extend_from_slice(&declared);
-        to.write_all(&start)?;
-        Ok(Self {
-            to,
-            at: start.len() as u64,
-            declared,
-            schemas: schemas.len(),
-            chunk: Vec::new(),
-            span: None,
-            index: vec![Vec::new(); topics.len()],
-            chunks: Vec::new(),
-            counts: vec![0; topics.len()],
-            whole: None,
-        })
+        start.extend_from_slice(&self.declared);
+        self.to.write_all(&start)?;
+        self.at = start.len() as u64;
+        Ok(())
     }
 
     /// Bytes so far, those of the open chunk included.
@@ -145,6 +166,11 @@ impl<W: Write> Writer<W> {
     /// Bytes that a cut would lose.
     pub fn unflushed(&self) -> usize {
         self.chunk.len()
+    }
+
+    /// Chunks written; the memory of their index is given back with the file.
+    pub const fn chunks(&self) -> u32 {
+        self.chunks
     }
 
     /// What it is written to.
@@ -159,9 +185,15 @@ impl<W: Write> Writer<W> {
             return;
         };
         index.push((time, self.chunk.len() as u64));
-        let content = Content::default().u16(topic as u16).u32(*count as u32).u64(time).u64(time);
+        let chunk = &mut self.chunk;
+        chunk.push(MESSAGE);
+        chunk.extend_from_slice(&(2 + 4 + 8 + 8 + data.len() as u64).to_le_bytes());
+        chunk.extend_from_slice(&(topic as u16).to_le_bytes());
+        chunk.extend_from_slice(&(*count as u32).to_le_bytes());
+        chunk.extend_from_slice(&time.to_le_bytes());
+        chunk.extend_from_slice(&time.to_le_bytes());
+        chunk.extend_from_slice(data);
         *count += 1;
-        record(&mut self.chunk, MESSAGE, &content.bytes(data).0);
         self.span = widened(self.span, time);
         self.whole = widened(self.whole, time);
     }
@@ -180,32 +212,56 @@ impl<W: Write> Writer<W> {
             .u32(crc32fast::hash(&self.chunk))
             .text("")
             .u64(size);
-        let mut out = Vec::with_capacity(self.chunk.len() + 1024);
-        record(&mut out, CHUNK, &head.bytes(&self.chunk).0);
-        let length = out.len() as u64;
+        let around = &mut self.around;
+        around.clear();
+        around.push(CHUNK);
+        around.extend_from_slice(&(head.0.len() as u64 + size).to_le_bytes());
+        around.extend_from_slice(&head.0);
+        self.to.write_all(around)?;
+        self.to.write_all(&self.chunk)?;
+        let length = around.len() as u64 + size;
+        around.clear();
         let mut offsets = Content::default();
         for (topic, entries) in self.index.iter_mut().enumerate().filter(|e| !e.1.is_empty()) {
-            offsets = offsets.u16(topic as u16).u64(self.at + out.len() as u64);
-            let list = entries.drain(..).fold(Content::default(), |c, (t, at)| c.u64(t).u64(at));
-            let content = Content::default().u16(topic as u16).block(&list.0);
-            record(&mut out, MESSAGE_INDEX, &content.0);
+            offsets = offsets.u16(topic as u16).u64(self.at + length + around.len() as u64);
+            around.push(MESSAGE_INDEX);
+            let list = 16 * entries.len() as u32;
+            around.extend_from_slice(&(2 + 4 + u64::from(list)).to_le_bytes());
+            around.extend_from_slice(&(topic as u16).to_le_bytes());
+            around.extend_from_slice(&list.to_le_bytes());
+            for (time, at) in entries.drain(..) {
+                around.extend_from_slice(&time.to_le_bytes());
+                around.extend_from_slice(&at.to_le_bytes());
+            }
         }
+        self.to.write_all(around)?;
+        self.to.flush()?;
         let index = Content::default()
             .u64(first)
             .u64(last)
             .u64(self.at)
             .u64(length)
             .block(&offsets.0)
-            .u64(out.len() as u64 - length)
+            .u64(around.len() as u64)
             .text("")
             .u64(size)
             .u64(size);
-        self.chunks.push(index.0);
+        record(&mut self.chunk_indexes, CHUNK_INDEX, &index.0);
+        self.chunks += 1;
+        self.at += length + around.len() as u64;
         self.chunk.clear();
-        self.to.write_all(&out)?;
-        self.to.flush()?;
-        self.at += out.len() as u64;
         Ok(())
+    }
+
+    /// Ends this file as [`Self::finish`] does and goes on in another; gives back the first.
+    ///
+    /// # Errors
+    /// When one of them cannot be written.
+    pub fn next(&mut self, to: W) -> io::Result<W> {
+        self.end()?;
+        let done = std::mem::replace(&mut self.to, to);
+        self.begin()?;
+        Ok(done)
     }
 
     /// Writes what is left and the summary; gives back what it was written to.
@@ -213,6 +269,11 @@ impl<W: Write> Writer<W> {
     /// # Errors
     /// When it cannot be written.
     pub fn finish(mut self) -> io::Result<W> {
+        self.end()?;
+        Ok(self.to)
+    }
+
+    fn end(&mut self) -> io::Result<()> {
         self.flush()?;
         let mut out = Vec::new();
         record(&mut out, DATA_END, &Content::default().u32(0).0);
@@ -227,25 +288,23 @@ impl<W: Write> Writer<W> {
             .u32(self.counts.len() as u32)
             .u32(0)
             .u32(0)
-            .u32(self.chunks.len() as u32)
+            .u32(self.chunks)
             .u64(first)
             .u64(last)
             .block(&counts.0);
         record(&mut out, STATISTICS, &statistics.0);
-        for chunk in &self.chunks {
-            record(&mut out, CHUNK_INDEX, chunk);
-        }
+        out.extend_from_slice(&self.chunk_indexes);
         // The checksum covers the summary up to itself.
         let mut footer = Content::default().u64(self.at + start as u64).u64(0);
-        let mut covered = out[start..].to_vec();
-        covered.push(FOOTER);
-        covered.extend_from_slice(&20_u64.to_le_bytes());
-        covered.extend_from_slice(&footer.0);
-        footer = footer.u32(crc32fast::hash(&covered));
+        let mut covered = crc32fast::Hasher::new();
+        covered.update(&out[start..]);
+        covered.update(&[FOOTER]);
+        covered.update(&20_u64.to_le_bytes());
+        covered.update(&footer.0);
+        footer = footer.u32(covered.finalize());
         record(&mut out, FOOTER, &footer.0);
         out.extend_from_slice(&MAGIC);
         self.to.write_all(&out)?;
-        self.to.flush()?;
-        Ok(self.to)
+        self.to.flush()
     }
 }

@@ -59,6 +59,7 @@ fn record(frame: u64) -> FrameRecord {
         latency: Duration::from_millis(7),
         tracking: Duration::from_millis(6),
         skipped: 0,
+        allocations: 0,
     }
 }
 

@@ -133,13 +133,15 @@ fn paint(buf: &mut [u8], fcc: &str, n: u32, w: u32, h: u32) {
 }
 
 /// What a Lepton says under its picture: status (flat field correction in bits 4 and 5) in words 3
-/// and 4, frame counter in words 20 and 21, low words first.
-fn telemetry(rows: &mut [u8], n: u32, ffc: u32) {
+/// and 4, frame counter in words 20 and 21, low words first; whether raw values are temperatures, and that
+/// their steps are 0.01 K, in words 48 and 49 of the third group of 80.
+fn telemetry(rows: &mut [u8], n: u32, ffc: u32, tlinear: bool) {
     let mut long = |word: usize, value: u32| {
         rows[2 * word..2 * word + 4].copy_from_slice(&value.to_le_bytes());
     };
     long(3, ffc << 4);
     long(20, n);
+    long(208, u32::from(tlinear) | 1 << 16);
 }
 
 /// Raw frames of a file that go by time from the moment `go` was made (the first one before), so that
@@ -195,6 +197,7 @@ fn usb_cam(model: &str, args: &[String]) -> R<()> {
     };
     let (ffc_every, ffc_frames): (u32, u32) =
         (num(args, "--ffc-every", 0), num(args, "--ffc-frames", 4));
+    let tlinear = num(args, "--tlinear", 1) == 1;
     let mut left: u32 = num(args, "--plugs", if plan.unplug_at > 0 { 2 } else { 1 });
     while left > 0 {
         left -= 1;
@@ -223,7 +226,7 @@ fn usb_cam(model: &str, args: &[String]) -> R<()> {
                     } else {
                         paint(&mut b[..38400], "Y16 ", n, w, 120);
                     }
-                    telemetry(&mut b[38400..], n, if ffc { 2 } else { 3 });
+                    telemetry(&mut b[38400..], n, if ffc { 2 } else { 3 }, tlinear);
                 }
                 ("boson", _, 514) => paint(&mut b[..640 * 512 * 2], "Y16 ", n, w, 512),
                 // picture above, temperatures below
