@@ -94,7 +94,9 @@ fn systemd_understands_the_unit() {
     // Which of them are found to be wrong.
     let typo = good.replace("WatchdogSec=30", "WatchdogSecs=30");
     let value = good.replace("LimitRTPRIO=50", "LimitRTPRIO=high");
-    for (name, text, right) in [("good", good, true), ("typo", typo, false), ("value", value, false)] {
+    for (name, text, right) in
+        [("good", good, true), ("typo", typo, false), ("value", value, false)]
+    {
         let folder = dir.path().join(name);
         fs::create_dir(&folder).expect("folder");
         let path = folder.join("tsda.service");

@@ -157,9 +157,7 @@ impl Layout {
     #[must_use]
     pub fn with_celsius(self, celsius: Option<Celsius>) -> Self {
         match celsius {
-            Some(_) if self.data.is_some() => {
-                Self { celsius, measured: Measured::Always, ..self }
-            }
+            Some(_) if self.data.is_some() => Self { celsius, measured: Measured::Always, ..self },
             _ => self,
         }
     }

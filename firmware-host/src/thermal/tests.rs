@@ -130,7 +130,10 @@ fn the_lepton_says_whether_it_measures_temperatures() {
         let bare = Profile::Lepton.layout(width, rows, true, u16::MAX).expect("layout");
         let thermal = Thermal::new(bare, AgcOptions::default()).expect("thermal");
         let data = bytes(&values[..width * rows]);
-        assert_eq!(thermal.temperature(&y16(&data, width, rows), &BBox::new(9.0, 9.0, 9.0, 9.0)), None);
+        assert_eq!(
+            thermal.temperature(&y16(&data, width, rows), &BBox::new(9.0, 9.0, 9.0, 9.0)),
+            None
+        );
         let grey = Profile::Lepton.layout(width, rows, false, 255).expect("layout");
         assert_eq!(grey.with_celsius(celsius), grey, "8 bits are no temperatures");
     }

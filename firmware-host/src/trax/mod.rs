@@ -18,7 +18,10 @@ mod region;
 mod session;
 mod transport;
 
-pub use base64::{Base64Error, decode as decode_base64, encode as encode_base64, encode_into as encode_base64_into};
+pub use base64::{
+    Base64Error, decode as decode_base64, encode as encode_base64,
+    encode_into as encode_base64_into,
+};
 pub use error::TraxError;
 pub use image::{ImageArg, ImageError, MemoryFormat};
 pub use message::{Kind, Message, MessageError, PREFIX};

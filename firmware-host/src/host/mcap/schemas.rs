@@ -32,7 +32,8 @@ fn stamp(nanos: u64) -> Value {
 
 /// A picture as a message, in place of what `out` holds.
 pub(super) fn image(time: u64, source: &str, jpeg: &[u8], out: &mut Vec<u8>) {
-    let head = json!({ "timestamp": stamp(time), "frame_id": source, "format": "jpeg" }).to_string();
+    let head =
+        json!({ "timestamp": stamp(time), "frame_id": source, "format": "jpeg" }).to_string();
     out.clear();
     // The last member goes into the object that is open but for its brace.
     out.extend_from_slice(head.strip_suffix('}').unwrap_or(&head).as_bytes());
