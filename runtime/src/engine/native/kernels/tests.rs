@@ -35,7 +35,28 @@ fn run(
     weights: &[f32],
 ) -> Vec<f32> {
     // Twice: what a kernel leaves behind must not matter to the next run.
-    let steps = vec![step.clone(), step.clone()];
+    run_steps(vec![step.clone(), step.clone()], k, threads, input, arena, weights)
+}
+
+/// As [`run`], for steps after one another without weights.
+fn run_all(
+    steps: Vec<Step>,
+    k: &'static Kernels,
+    threads: usize,
+    input: &[f32],
+    arena: usize,
+) -> Vec<f32> {
+    run_steps([steps.clone(), steps].concat(), k, threads, input, arena, &[0.0])
+}
+
+fn run_steps(
+    steps: Vec<Step>,
+    k: &'static Kernels,
+    threads: usize,
+    input: &[f32],
+    arena: usize,
+    weights: &[f32],
+) -> Vec<f32> {
     let program = Program::new(steps, arena, weights.len(), threads, k).unwrap();
     let mut team = Team::new(arena, weights.to_vec(), vec![program], k, threads, false).unwrap();
     let all = team.view_mut(0..arena);
