@@ -10,7 +10,7 @@ use tsda_export::{bundle, network};
 use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, Provenance, SectionKind, TrainedOn};
 use tsda_runtime::engine::EngineChoice;
 use tsda_runtime::probe;
-use tsda_runtime::{Backbone, ModelSpec, TrackerParams};
+use tsda_runtime::{Backbone, ModelSpec};
 use tsda_trainer::burn_engine::BurnEngine;
 use tsda_trainer::import::save_weights;
 
@@ -45,20 +45,7 @@ fn random_bundle(name: &str, spec: &ModelSpec) -> (Vec<u8>, usize) {
     let boxes = probe::default_boxes(spec);
     let outputs = probe::capture(&mut BurnEngine::new(&net), &boxes).unwrap();
     sections.push((SectionKind::Probe, outputs));
-    let manifest = Manifest {
-        name,
-        spec: *spec,
-        tracker: TrackerParams::default(),
-        trained_on: TrainedOn::default(),
-        calibration: None,
-        provenance: Provenance::default(),
-        figures: Default::default(),
-        licence: "none",
-        card: "# Random",
-        sections: Default::default(),
-        precision: None,
-        motion: None,
-    };
+    let manifest = Manifest { card: "# Random", ..Manifest::new(name, *spec) };
     (bundle::encode(&manifest, &sections).unwrap(), network::parameters(&net))
 }
 
@@ -351,18 +338,11 @@ fn the_written_bundle_reads_back() {
     ];
     for card in ["", "x", &"card ".repeat(2000)] {
         let manifest = Manifest {
-            name: "m",
-            spec: ModelSpec::NANO,
-            tracker: TrackerParams::default(),
             trained_on: TrainedOn { rgb: true, thermal: false, cross_modal: false },
-            calibration: None,
             provenance: Provenance { seed: u64::MAX, ..Default::default() },
-            figures: Default::default(),
             licence: "MIT",
             card,
-            sections: Default::default(),
-            precision: None,
-            motion: None,
+            ..Manifest::new("m", ModelSpec::NANO)
         };
         let bytes = bundle::encode(&manifest, &sections).unwrap();
         let read = Bundle::parse(&bytes).unwrap();
@@ -378,20 +358,7 @@ fn the_written_bundle_reads_back() {
 }
 
 fn empty() -> Manifest<'static> {
-    Manifest {
-        name: "m",
-        spec: ModelSpec::NANO,
-        tracker: TrackerParams::default(),
-        trained_on: TrainedOn::default(),
-        calibration: None,
-        provenance: Provenance::default(),
-        figures: Default::default(),
-        licence: "",
-        card: "",
-        sections: Default::default(),
-        precision: None,
-        motion: None,
-    }
+    Manifest { licence: "", ..Manifest::new("m", ModelSpec::NANO) }
 }
 
 /// A missing library is an error, not a panic, and does not hide what tract computes.

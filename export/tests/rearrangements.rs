@@ -6,10 +6,10 @@ use tsda_export::macs::{self, MacsReport};
 use tsda_export::network::{self, NetworkGraph};
 use tsda_export::onnx::{Graph, Node};
 use tsda_export::{bundle, onnx};
-use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, Provenance, SectionKind, TrainedOn};
+use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, SectionKind};
 use tsda_runtime::engine::TractEngine;
 use tsda_runtime::probe::{self, Probe};
-use tsda_runtime::{Backbone, ModelSpec, TrackerParams};
+use tsda_runtime::{Backbone, ModelSpec};
 use tsda_trainer::burn_engine::BurnEngine;
 use tsda_trainer::model::SlotForm;
 
@@ -223,20 +223,7 @@ fn either_form_of_slot_runs_in_the_engine() {
         let graphs = network::graphs_as(&net, form).unwrap();
         let mut sections = network::files(&graphs);
         sections.push((SectionKind::Probe, outputs.clone()));
-        let manifest = Manifest {
-            name: "small",
-            spec,
-            tracker: TrackerParams::default(),
-            trained_on: TrainedOn::default(),
-            calibration: None,
-            provenance: Provenance::default(),
-            figures: Default::default(),
-            licence: "none",
-            card: "",
-            sections: Default::default(),
-            precision: None,
-            motion: None,
-        };
+        let manifest = Manifest::new("small", spec);
         let bytes = bundle::encode(&manifest, &sections).unwrap();
         let bundle = Bundle::parse(&bytes).unwrap();
         let probe = Probe::parse(bundle.section(SectionKind::Probe).unwrap(), &spec).unwrap();

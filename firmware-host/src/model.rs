@@ -48,13 +48,8 @@ pub fn tracker_on(
     choice: &EngineChoice,
 ) -> Result<Tracker<AnyEngine>, HostError> {
     let bundle = file.bundle()?;
-    let manifest = bundle.manifest();
-    let failed = |source| HostError::Tracker { frame: 0, source: Box::new(source) };
-    let mut tracker =
-        Tracker::new(engine(file, &bundle, choice)?, manifest.tracker).map_err(failed)?;
-    tracker.set_calibration(manifest.calibration).map_err(|e| failed(e.into()))?;
-    tracker.set_motion_prior(manifest.motion).map_err(|e| failed(e.into()))?;
-    Ok(tracker)
+    Tracker::from_manifest(engine(file, &bundle, choice)?, bundle.manifest())
+        .map_err(|source| HostError::Tracker { frame: 0, source: Box::new(source) })
 }
 
 /// An engine for a bundle.

@@ -141,25 +141,10 @@ fn next<E: Engine>(
     let failed = |e| HostError::Tracker { frame: frame.index, source: Box::new(e) };
     let start = Instant::now();
     let now = (frame.view.width(), frame.view.height());
-    follow_size(tracker, before, size.unwrap_or(now), now).map_err(failed)?;
+    tracker.follow_size(before, size.unwrap_or(now), now).map_err(failed)?;
     let Track { bbox, score, confidence, state, .. } =
         tracker.update(&frame.view, Some(frame.modality)).map_err(failed)?;
     Ok(step(frame, bbox, (score, confidence), state, start))
-}
-
-/// Scales the target along when frames change their size: both sensors are taken to see the same
-/// field of view.
-pub(crate) fn follow_size<E: Engine>(
-    tracker: &mut Tracker<E>,
-    last: BBox,
-    old: (usize, usize),
-    now: (usize, usize),
-) -> Result<(), TrackError> {
-    if old == now {
-        return Ok(());
-    }
-    let (kx, ky) = (now.0 as f32 / old.0 as f32, now.1 as f32 / old.1 as f32);
-    tracker.set_box(BBox::new(last.x * kx, last.y * ky, last.w * kx, last.h * ky))
 }
 
 fn step(

@@ -10,7 +10,7 @@ pub use motion::MotionPrior;
 pub use redetect::RedetectOptions;
 pub use state::{Search, Target, TrackState};
 
-use crate::bundle::ScoreCalibration;
+use crate::bundle::{Manifest, ScoreCalibration};
 use crate::crop::{self, Patch, Window, round_half_even};
 use crate::engine::{Engine, EngineError};
 use crate::frame::FrameView;
@@ -88,6 +88,17 @@ impl<E: Engine> Tracker<E> {
             scan: None,
             motion: None,
         })
+    }
+
+    /// A tracker as a bundle wants it: with its thresholds, calibration and motion prior.
+    ///
+    /// # Errors
+    /// As [`Self::new`], and when calibration or motion prior are out of range.
+    pub fn from_manifest(engine: E, manifest: &Manifest<'_>) -> Result<Self, TrackError> {
+        let mut tracker = Self::new(engine, manifest.tracker)?;
+        tracker.set_calibration(manifest.calibration)?;
+        tracker.set_motion_prior(manifest.motion)?;
+        Ok(tracker)
     }
 
     /// Takes the target from the annotated frame (spec 3.2, 3.3). May be called again at any time
@@ -202,6 +213,24 @@ impl<E: Engine> Tracker<E> {
         error::check_size(&bbox)?;
         target.place(&bbox);
         Ok(())
+    }
+
+    /// Scales the target along when frames change their size, `(width, height)` in pixels: both
+    /// sensors are taken to see the same field of view. `last` is the box in the `old` frame.
+    ///
+    /// # Errors
+    /// See [`Self::set_box`].
+    pub fn follow_size(
+        &mut self,
+        last: BBox,
+        old: (usize, usize),
+        now: (usize, usize),
+    ) -> Result<(), TrackError> {
+        if old == now {
+            return Ok(());
+        }
+        let (kx, ky) = (now.0 as f32 / old.0 as f32, now.1 as f32 / old.1 as f32);
+        self.set_box(BBox::new(last.x * kx, last.y * ky, last.w * kx, last.h * ky))
     }
 
     /// Looks at the next positions of the grid; the best find above the threshold, if there is one.

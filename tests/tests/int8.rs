@@ -6,9 +6,7 @@ use synthetic::{HEIGHT, Moving, WIDTH, clips};
 use tsda_eval::dataset::Sequence as _;
 use tsda_export::quantize::{QuantizeError, QuantizeOptions, quantize, quantize_on};
 use tsda_export::{bundle, network};
-use tsda_runtime::bundle::{
-    Bundle, BundleFile, Manifest, Numbers, Provenance, SectionKind, TrainedOn,
-};
+use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, Numbers, SectionKind};
 use tsda_runtime::engine::native::Isa;
 use tsda_runtime::engine::{EngineChoice, NativeEngine, NativeOptions};
 use tsda_runtime::probe::{self, Probe};
@@ -34,18 +32,8 @@ fn random(spec: &ModelSpec) -> Vec<u8> {
     let outputs = probe::capture(&mut BurnEngine::new(&net), &boxes).unwrap();
     sections.push((SectionKind::Probe, outputs));
     let manifest = Manifest {
-        name: "random",
-        spec: *spec,
         tracker: TrackerParams { not_found: 0.0, write_confidence: 0.0, ..Default::default() },
-        trained_on: TrainedOn::default(),
-        calibration: None,
-        provenance: Provenance::default(),
-        figures: Default::default(),
-        licence: "none",
-        card: "",
-        sections: Default::default(),
-        precision: None,
-        motion: None,
+        ..Manifest::new("random", *spec)
     };
     bundle::encode(&manifest, &sections).unwrap()
 }

@@ -1,7 +1,7 @@
 //! Trainer, export and engine compute the same numbers, frame after frame.
 
 use tsda_export::{bundle, network};
-use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, Provenance, SectionKind, TrainedOn};
+use tsda_runtime::bundle::{Bundle, BundleFile, Manifest, SectionKind};
 use tsda_runtime::engine::{EngineChoice, NativeEngine, NativeOptions, TractEngine};
 use tsda_runtime::probe::{self, Probe};
 use tsda_runtime::{BBox, Engine, FrameView, ModelSpec, Tracker, TrackerParams};
@@ -44,20 +44,7 @@ fn burn_and_the_engines_drive_the_tracker_alike() {
     // Every frame counts as found and is learnt, so that both slots and all graphs are used.
     let tracker =
         TrackerParams { not_found: 0.0, write_confidence: 0.0, ..TrackerParams::default() };
-    let manifest = Manifest {
-        name: "random",
-        spec,
-        tracker,
-        trained_on: TrainedOn::default(),
-        calibration: None,
-        provenance: Provenance::default(),
-        figures: Default::default(),
-        licence: "none",
-        card: "",
-        sections: Default::default(),
-        precision: None,
-        motion: None,
-    };
+    let manifest = Manifest { tracker, ..Manifest::new("random", spec) };
     let bytes =
         bundle::encode(&manifest, &network::files(&network::graphs(&net).unwrap())).unwrap();
     let bundle = Bundle::parse(&bytes).unwrap();

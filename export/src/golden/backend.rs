@@ -17,9 +17,9 @@ use crate::{bundle, network};
 use burn::module::Module as _;
 use burn::tensor::{Device, Tensor, TensorData};
 use std::collections::HashMap;
-use tsda_runtime::bundle::{Bundle, Manifest, Provenance, TrainedOn};
+use tsda_runtime::bundle::{Bundle, Manifest};
 use tsda_runtime::engine::{NativeEngine, TractEngine};
-use tsda_runtime::{Engine, EngineError, ModelSpec, TrackerParams};
+use tsda_runtime::{Engine, EngineError, ModelSpec};
 use tsda_trainer::import::{StateDict, StateTensor};
 use tsda_trainer::model::TrackerNet;
 use tsda_trainer::model::inspect::{HeadInput, Mode, Parts};
@@ -379,20 +379,7 @@ fn on_engine<E: Engine + 'static>(
     load: graphs::Load,
 ) -> Result<Vec<Box<dyn Backend>>, GoldenError> {
     let net = net.valid();
-    let manifest = Manifest {
-        name: "golden",
-        spec: *net.spec(),
-        tracker: TrackerParams::default(),
-        trained_on: TrainedOn::default(),
-        calibration: None,
-        provenance: Provenance::default(),
-        figures: Default::default(),
-        licence: "none",
-        card: "",
-        sections: Default::default(),
-        precision: None,
-        motion: None,
-    };
+    let manifest = Manifest::new("golden", *net.spec());
     let graphs = network::graphs(&net)?;
     let engine = {
         let bytes = bundle::encode(&manifest, &network::files(&graphs))?;

@@ -2,13 +2,13 @@
 
 use super::QuantizeError;
 use super::graph::{File, Product};
-use super::measure::Runner;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::rc::Rc;
+use tsda_eval::RuntimeTracker;
 use tsda_eval::dataset::Dataset;
 use tsda_eval::protocol::{Protocol, TrackerError, TrackerUnderTest as _};
-use tsda_runtime::bundle::{Bundle, SectionKind};
+use tsda_runtime::bundle::{Bundle, Manifest, SectionKind};
 use tsda_runtime::engine::native::{GraphSession, Isa};
 use tsda_runtime::engine::{Engine, EngineError, Maps, Stage, TemplateInput};
 use tsda_runtime::{ModelSpec, Tracker, TrackerParams};
@@ -298,12 +298,14 @@ pub fn ranges(
     let mut runners = Vec::with_capacity(2);
     for params in [deployed, eager] {
         let engine = Watching::new(bundle, files, products, seen.clone())?;
-        let failed =
-            |source| QuantizeError::Track { sequence: data.name.clone(), frame: 0, source };
-        let mut tracker = Tracker::new(engine, params).map_err(|e| failed(TrackerError::new(e)))?;
-        let motion = bundle.manifest().motion;
-        tracker.set_motion_prior(motion).map_err(|e| failed(TrackerError::new(e)))?;
-        runners.push(Runner::new(tracker));
+        let manifest = Manifest { tracker: params, ..bundle.manifest().clone() };
+        let tracker =
+            Tracker::from_manifest(engine, &manifest).map_err(|e| QuantizeError::Track {
+                sequence: data.name.clone(),
+                frame: 0,
+                source: TrackerError::new(e),
+            })?;
+        runners.push(RuntimeTracker::new("bundle", tracker));
     }
     let tracked = track(&mut runners, data, frames)?;
     let seen = seen.borrow();
@@ -321,7 +323,7 @@ pub fn ranges(
 }
 
 fn track(
-    runners: &mut [Runner<Watching>],
+    runners: &mut [RuntimeTracker<Watching>],
     data: &Dataset,
     frames: usize,
 ) -> Result<usize, QuantizeError> {

@@ -1,56 +1,14 @@
 //! What the tracker loses.
 
 use super::{LossReport, QuantizeError};
-use tsda_eval::dataset::{Dataset, Picture};
-use tsda_eval::evaluate;
+use tsda_eval::dataset::Dataset;
 use tsda_eval::evaluate::{Options, can_run};
 use tsda_eval::protocol::{Protocol, TrackerError, TrackerUnderTest};
 use tsda_eval::summary::ProtocolSummary;
+use tsda_eval::{RuntimeTracker, evaluate};
+use tsda_runtime::Tracker;
 use tsda_runtime::bundle::Bundle;
 use tsda_runtime::engine::NativeEngine;
-use tsda_runtime::{BBox, Engine, Modality, Tracker};
-
-/// A tracker that follows changes of the picture's size, as the programs do: both sensors are taken
-/// to see the same field of view.
-pub(super) struct Runner<E: Engine> {
-    tracker: Tracker<E>,
-    size: (usize, usize),
-    last: BBox,
-}
-
-impl<E: Engine> Runner<E> {
-    pub fn new(tracker: Tracker<E>) -> Self {
-        Self { tracker, size: (0, 0), last: BBox::default() }
-    }
-}
-
-impl<E: Engine> TrackerUnderTest for Runner<E> {
-    fn name(&self) -> &str {
-        "bundle"
-    }
-
-    fn init(&mut self, p: &Picture, bbox: BBox, modality: Modality) -> Result<(), TrackerError> {
-        let view = p.view().map_err(TrackerError::new)?;
-        self.size = (p.width, p.height);
-        self.last = bbox;
-        self.tracker.init(&view, bbox, Some(modality)).map_err(TrackerError::new)
-    }
-
-    fn update(&mut self, p: &Picture, modality: Modality) -> Result<(BBox, f32), TrackerError> {
-        let view = p.view().map_err(TrackerError::new)?;
-        let now = (p.width, p.height);
-        if now != self.size {
-            let (kx, ky) = (now.0 as f32 / self.size.0 as f32, now.1 as f32 / self.size.1 as f32);
-            let b = self.last;
-            let scaled = BBox::new(b.x * kx, b.y * ky, b.w * kx, b.h * ky);
-            self.tracker.set_box(scaled).map_err(TrackerError::new)?;
-            self.size = now;
-        }
-        let track = self.tracker.update(&view, Some(modality)).map_err(TrackerError::new)?;
-        self.last = track.bbox;
-        Ok((track.bbox, track.score))
-    }
-}
 
 /// Figures of two bundles on one dataset, under every cross-modal protocol it can be run with.
 ///
@@ -75,11 +33,10 @@ pub fn losses(
             progress(&format!("measuring on {name}, {protocol}, {which}"));
             let make = || {
                 let engine = NativeEngine::from_bundle(bundle).map_err(TrackerError::new)?;
-                let manifest = bundle.manifest();
-                let mut tracker =
-                    Tracker::new(engine, manifest.tracker).map_err(TrackerError::new)?;
-                tracker.set_motion_prior(manifest.motion).map_err(TrackerError::new)?;
-                Ok(Box::new(Runner::new(tracker)) as Box<dyn TrackerUnderTest>)
+                let tracker =
+                    Tracker::from_manifest(engine, bundle.manifest()).map_err(TrackerError::new)?;
+                let under_test = RuntimeTracker::new("bundle", tracker);
+                Ok(Box::new(under_test) as Box<dyn TrackerUnderTest>)
             };
             let found = evaluate(data, protocol, &make, Options::default(), &|_| {})?;
             means.push(ProtocolSummary::of(&found).mean);

@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use tsda_eval::baselines::{MatchOn, StaticBox, TemplateMatcher};
-use tsda_eval::dataset::{self, Dataset, Picture, Scan};
+use tsda_eval::dataset::{self, Dataset, Scan};
 use tsda_eval::evaluate::{Extent, Failure, Observer, can_run, never_switches};
 use tsda_eval::protocol::{EvalError, Protocol, TrackerError, TrackerUnderTest};
 use tsda_eval::pseudo::PseudoOptions;
@@ -18,54 +18,20 @@ use tsda_eval::results::file_stem;
 use tsda_eval::run_summary::{RunContext, RunSummary, convention_of, sum_up};
 use tsda_eval::store::{ResultStore, RunManifest, STORE_VERSION};
 use tsda_eval::summary::markdown;
-use tsda_eval::{Options, Progress, evaluate_all, fingerprint, tables};
+use tsda_eval::{Options, Progress, RuntimeTracker, evaluate_all, fingerprint, tables};
 use tsda_runtime::bundle::BundleFile;
 use tsda_runtime::engine::{AnyEngine, EngineChoice};
-use tsda_runtime::{BBox, Modality, Tracker};
 
 /// A bundle's tracker as the evaluation drives it.
-struct BundleTracker {
-    name: String,
-    tracker: Tracker<AnyEngine>,
-    /// Size of the frame before: sensors may differ in resolution.
-    size: (usize, usize),
-    last: BBox,
-}
-
-impl BundleTracker {
-    fn new(
-        file: &BundleFile,
-        choice: &EngineChoice,
-        redetect: RedetectArgs,
-    ) -> Result<Self, HostError> {
-        let name = file.bundle()?.manifest().name.to_owned();
-        let mut tracker = model::tracker_on(file, choice)?;
-        redetect.apply(&mut tracker)?;
-        Ok(Self { name, tracker, size: (0, 0), last: BBox::default() })
-    }
-}
-
-impl TrackerUnderTest for BundleTracker {
-    fn name(&self) -> &str {
-        &self.name
-    }
-
-    fn init(&mut self, p: &Picture, bbox: BBox, modality: Modality) -> Result<(), TrackerError> {
-        let view = p.view().map_err(TrackerError::new)?;
-        self.size = (p.width, p.height);
-        self.last = bbox;
-        self.tracker.init(&view, bbox, Some(modality)).map_err(TrackerError::new)
-    }
-
-    fn update(&mut self, p: &Picture, modality: Modality) -> Result<(BBox, f32), TrackerError> {
-        let view = p.view().map_err(TrackerError::new)?;
-        crate::track::follow_size(&mut self.tracker, self.last, self.size, (p.width, p.height))
-            .map_err(TrackerError::new)?;
-        self.size = (p.width, p.height);
-        let track = self.tracker.update(&view, Some(modality)).map_err(TrackerError::new)?;
-        self.last = track.bbox;
-        Ok((track.bbox, track.score))
-    }
+fn under_test(
+    file: &BundleFile,
+    choice: &EngineChoice,
+    redetect: RedetectArgs,
+) -> Result<RuntimeTracker<AnyEngine>, HostError> {
+    let name = file.bundle()?.manifest().name.to_owned();
+    let mut tracker = model::tracker_on(file, choice)?;
+    redetect.apply(&mut tracker)?;
+    Ok(RuntimeTracker::new(name, tracker))
 }
 
 type Maker<'a> = Box<dyn Fn() -> Result<Box<dyn TrackerUnderTest>, TrackerError> + Sync + 'a>;
@@ -113,8 +79,8 @@ pub(super) fn run(args: &EvalArgs) -> Result<u8, HostError> {
         engine: args.engine.to_string(),
         settings: args.redetect.to_string(),
         make: Box::new(|| {
-            let tracker = BundleTracker::new(&bundle, &args.engine, args.redetect)
-                .map_err(TrackerError::new)?;
+            let tracker =
+                under_test(&bundle, &args.engine, args.redetect).map_err(TrackerError::new)?;
             Ok(Box::new(tracker) as Box<dyn TrackerUnderTest>)
         }),
         stores: Vec::new(),

@@ -38,6 +38,27 @@ pub struct Manifest<'a> {
     pub motion: Option<MotionPrior>,
 }
 
+impl<'a> Manifest<'a> {
+    /// Of a network that nothing else is known of: the reference's thresholds, no calibration,
+    /// figures, card or motion prior, licence "none".
+    pub fn new(name: &'a str, spec: ModelSpec) -> Self {
+        Self {
+            name,
+            spec,
+            tracker: TrackerParams::default(),
+            trained_on: TrainedOn::default(),
+            calibration: None,
+            provenance: Provenance::default(),
+            figures: heapless::Vec::new(),
+            licence: "none",
+            card: "",
+            sections: heapless::Vec::new(),
+            precision: None,
+            motion: None,
+        }
+    }
+}
+
 /// What a file of format version 2 has behind the manifest of version 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Trailer<'a> {

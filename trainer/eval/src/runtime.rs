@@ -6,17 +6,21 @@ use tsda_runtime::{BBox, Engine, Modality};
 use crate::dataset::Picture;
 use crate::protocol::{TrackerError, TrackerUnderTest};
 
-/// A [`Tracker`] with a name for reports.
+/// A [`Tracker`] with a name for reports. It follows changes of the picture's size
+/// ([`Tracker::follow_size`]), as the programs do.
 #[derive(Debug)]
 pub struct RuntimeTracker<E> {
     name: String,
     tracker: Tracker<E>,
+    /// Of the frame before: sensors may differ in resolution.
+    size: (usize, usize),
+    last: BBox,
 }
 
 impl<E: Engine> RuntimeTracker<E> {
     /// `name` stands in tables and result files, for instance the bundle's name and the engine's.
     pub fn new(name: impl Into<String>, tracker: Tracker<E>) -> Self {
-        Self { name: name.into(), tracker }
+        Self { name: name.into(), tracker, size: (0, 0), last: BBox::default() }
     }
 
     /// The tracker.
@@ -37,12 +41,17 @@ impl<E: Engine> TrackerUnderTest for RuntimeTracker<E> {
         modality: Modality,
     ) -> Result<(), TrackerError> {
         let view = frame.view().map_err(TrackerError::new)?;
+        (self.size, self.last) = ((frame.width, frame.height), bbox);
         self.tracker.init(&view, bbox, Some(modality)).map_err(TrackerError::new)
     }
 
     fn update(&mut self, frame: &Picture, modality: Modality) -> Result<(BBox, f32), TrackerError> {
         let view = frame.view().map_err(TrackerError::new)?;
+        let now = (frame.width, frame.height);
+        self.tracker.follow_size(self.last, self.size, now).map_err(TrackerError::new)?;
+        self.size = now;
         let track = self.tracker.update(&view, Some(modality)).map_err(TrackerError::new)?;
+        self.last = track.bbox;
         Ok((track.bbox, track.score))
     }
 }

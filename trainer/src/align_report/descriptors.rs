@@ -160,6 +160,7 @@ impl Target {
             region: drawn.region,
             distractor: None,
             occluder: None,
+            absence: None,
         };
         let [mut a, mut b] =
             [drawn, &swapped].map(|drawn| processor.process(drawn, &mut rng.clone()));

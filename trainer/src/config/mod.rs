@@ -140,6 +140,14 @@ pub struct SamplerConfig {
     /// Chance that part of a picture of another sequence of the source covers part of the target in
     /// the search crop. Training only.
     pub occluder_p: f64,
+    /// Chance that the search crop does not show the target: it is either cut around a target of
+    /// another sequence, or what lies beside the target is copied over it. Its score map is then all
+    /// background, and it takes no part in the box loss. Training only; not with contrastive alignment.
+    pub absent_p: f64,
+    /// Chance, in samples across sensors, that a template after the first comes from the search
+    /// frame's sensor, as it does in the tracker's memory some time after a change of sensor. Training
+    /// only; not with alignment, which needs templates of one sensor.
+    pub mixed_templates_p: f64,
     /// Samples that count as one epoch.
     pub samples_per_epoch: usize,
 }
@@ -157,6 +165,8 @@ impl Default for SamplerConfig {
             gap: 200,
             distractor_p: 0.0,
             occluder_p: 0.0,
+            absent_p: 0.0,
+            mixed_templates_p: 0.0,
             samples_per_epoch: 4000,
         }
     }

@@ -284,6 +284,11 @@ fn alignment_that_cannot_be_is_refused() {
         ("[align.contrastive]\ntemperature = 0.0\n", "align.contrastive.temperature"),
         ("[align.contrastive]\ndim = 0\n", "align.contrastive.dim"),
         ("[align.contrastive]\n[run]\nbatch = 1\n", "run.batch"),
+        ("[align.contrastive]\n[sampler]\nabsent_p = 0.1\n", "sampler.absent_p"),
+        (
+            "[align]\npreset = \"enc-afa\"\n[sampler]\nmixed_templates_p = 0.1\n",
+            "sampler.mixed_templates_p",
+        ),
     ] {
         match parse(&format!("{MINIMAL}{text}")).unwrap_err() {
             ConfigError::Field { field: f, .. } => assert_eq!(f.field, field, "{f}"),

@@ -136,6 +136,8 @@ fn check_sampler(s: &SamplerConfig) -> Result<(), FieldError> {
     count("sampler.gap", s.gap as u64, 1, 1_000_000)?;
     share("sampler.distractor_p", s.distractor_p)?;
     share("sampler.occluder_p", s.occluder_p)?;
+    share("sampler.absent_p", s.absent_p)?;
+    share("sampler.mixed_templates_p", s.mixed_templates_p)?;
     count("sampler.samples_per_epoch", s.samples_per_epoch as u64, 1, 1_000_000_000)
 }
 
@@ -241,6 +243,16 @@ fn check_align(e: &Experiment) -> Result<(), FieldError> {
             return fail("sampler.cross_modal_p", 0, want);
         }
         _ => {}
+    }
+    let s = &e.sampler;
+    if a.is_on() && s.mixed_templates_p > 0.0 {
+        let want = "0 with alignment, which compares templates of one sensor with the search crop";
+        return fail("sampler.mixed_templates_p", s.mixed_templates_p, want);
+    }
+    if a.contrastive().is_some() && s.absent_p > 0.0 {
+        let want =
+            "0 with contrastive alignment, for which every search crop has to show its target";
+        return fail("sampler.absent_p", s.absent_p, want);
     }
     let (start, total) = (e.align_start(), e.total_steps());
     if a.is_on() && start >= total {

@@ -52,6 +52,7 @@ fn parts(batch: &Batch, count: usize) -> Vec<Batch> {
                 search_labels: part(&batch.search_labels, count, i),
                 search_ltrb: part(&batch.search_ltrb, count, i),
                 region: part(&batch.region, count, i),
+                present: part(&batch.present, count, i),
                 search_boxes: part(&batch.search_boxes, count, i),
             }
         })
@@ -97,11 +98,15 @@ fn two_batches_of_four_have_the_gradients_of_one_of_eight() {
     half.region[4 * cells..].fill(false);
     let mut none = whole.clone();
     none.region.fill(false);
+    let mut absent = none.clone();
+    absent.present.fill(false);
+    absent.search_labels.fill(0.0);
     let cases = [
         ("even", whole, &[2, 4][..]),
         ("uneven", uneven, &[2]),
         ("half", half, &[4]),
         ("none", none, &[2]),
+        ("absent", absent, &[2]),
     ];
     for (what, batch, counts) in cases {
         let state = state(&experiment, true);

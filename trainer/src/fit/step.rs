@@ -139,11 +139,14 @@ fn is_norm(name: &str) -> bool {
 }
 
 /// How much a batch counts in the box loss: its part of the region's cells of all batches, over which
-/// the mean is taken. Equal parts where there are none at all (spec 2.5, quirk Q10).
+/// the mean is taken. Equal parts where there are none at all (spec 2.5, quirk Q10), and no part where that
+/// is because no search crop shows its target.
 fn giou_shares(batches: &[Batch]) -> Vec<f64> {
     let cells = |batch: &Batch| batch.region.iter().filter(|r| **r).count() as f64;
     let total: f64 = batches.iter().map(cells).sum();
-    let share = |batch| if total > 0.0 { cells(batch) / total } else { 1.0 / batches.len() as f64 };
+    let present = batches.iter().any(|batch| batch.present.contains(&true));
+    let none = if present { 1.0 / batches.len() as f64 } else { 0.0 };
+    let share = |batch| if total > 0.0 { cells(batch) / total } else { none };
     batches.iter().map(share).collect()
 }
 

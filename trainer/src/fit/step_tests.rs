@@ -46,6 +46,7 @@ pub(super) fn golden_batch() -> Batch {
         search_crops: images(&[2]),
         search_labels: each("test_label"),
         search_ltrb: each("test_ltrb"),
+        present: vec![true; 3],
         region: each("test_region").iter().map(|v| *v != 0.0).collect(),
         search_boxes: boxes.chunks_exact(4).map(|b| BBox::new(b[0], b[1], b[2], b[3])).collect(),
     }

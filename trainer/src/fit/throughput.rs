@@ -143,6 +143,7 @@ pub(super) fn synthetic_batch(spec: &ModelSpec, size: usize, templates: usize) -
         search_labels: Vec::new(),
         search_ltrb: Vec::new(),
         region: Vec::new(),
+        present: vec![true; size],
         search_boxes: (0..size).map(target).collect(),
     };
     for i in 0..size * templates {

@@ -32,6 +32,9 @@ pub struct Batch {
     pub search_ltrb: Vec<f32>,
     /// `(B, F, F)` where the box loss is taken.
     pub region: Vec<bool>,
+    /// Which search crops show the target, `(B)`; the others' labels are all background and their
+    /// region is empty.
+    pub present: Vec<bool>,
     /// Targets in the search crops, crop pixels.
     pub search_boxes: Vec<BBox>,
 }
@@ -53,6 +56,7 @@ impl Batch {
             search_labels: Vec::new(),
             search_ltrb: Vec::new(),
             region: Vec::new(),
+            present: samples.iter().map(|s| s.present).collect(),
             search_boxes: samples.iter().map(|s| s.search.bbox).collect(),
         };
         let mut label = vec![0.0; spec.cells()];
@@ -69,9 +73,14 @@ impl Batch {
             let sigma = spec.label_sigma_cells();
             gaussian(box_centre(spec, bbox), sigma, spec.map_side(), &mut label);
             ltrb(spec, bbox, &mut edges);
+            let mut region = sample_region(spec, bbox);
+            if !sample.present {
+                label.fill(0.0);
+                region.fill(false);
+            }
             batch.search_labels.extend_from_slice(&label);
             batch.search_ltrb.extend_from_slice(&edges);
-            batch.region.extend(sample_region(spec, bbox));
+            batch.region.extend(region);
         }
         batch
     }

@@ -1,8 +1,9 @@
 //! From drawn frames to network input (spec 2.2 to 2.4).
 //!
 //! Order, for one sample: one draw for all frames (grey or channel mixture, whole-picture mirror,
-//! polarity); then for every crop on its own: jitter, cut, (search crop) distractor and occluder,
-//! window, tone curve, smear, blur and noise, brightness, mirror, normalisation. Labels are made from the box in crop pixels.
+//! polarity); then for every crop on its own: jitter, cut, (search crop) target covered, distractor
+//! and occluder, window, tone curve, smear, blur and noise, brightness, mirror, normalisation. Labels
+//! are made from the box in crop pixels.
 //!
 //! Everything random of a sample comes from one ChaCha8 stream keyed by `(seed, index)`
 //! ([`sample_rng`]), so a batch depends on nothing but the seed and its step.
@@ -18,7 +19,7 @@ pub use crop::{CropRule, CropWindow, jittered};
 pub use sheet::contact_sheet;
 
 use crate::config::{JitterConfig, PhotometricConfig, ProcessingConfig};
-use crate::sampler::{Drawn, DrawnFrame};
+use crate::sampler::{Absence, Drawn, DrawnFrame};
 use augment::Pixels;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -47,6 +48,8 @@ pub struct Sample {
     pub search: Crop,
     /// Does the search crop come from another sensor?
     pub cross: bool,
+    /// Does the search crop show the target? Where not, its box is where something else is.
+    pub present: bool,
 }
 
 impl Sample {
@@ -106,6 +109,8 @@ struct Joint {
 struct Others<'a> {
     distractor: Option<&'a DrawnFrame>,
     occluder: Option<&'a DrawnFrame>,
+    /// Is the target to be covered by what lies beside it?
+    covered: bool,
 }
 
 /// Turns drawn frames into crops.
@@ -141,19 +146,29 @@ impl Processor {
         if self.augment && config.channel_mix_p > 0.0 && rng.random_bool(config.channel_mix_p) {
             joint.grey = Some(augment::channel_mix(rng));
         }
-        let nothing = Others { distractor: None, occluder: None };
+        let nothing = Others { distractor: None, occluder: None, covered: false };
         let templates = drawn
             .templates
             .iter()
-            .map(|f| self.crop(f, &config.template, &joint, &nothing, rng))
+            .map(|f| self.crop(f, &config.template, &joint, &nothing, rng).0)
             .collect();
-        let others =
-            Others { distractor: drawn.distractor.as_ref(), occluder: drawn.occluder.as_ref() };
+        let absence = drawn.absence.as_ref().filter(|_| self.augment);
+        let others = Others {
+            distractor: drawn.distractor.as_ref(),
+            occluder: drawn.occluder.as_ref(),
+            covered: matches!(absence, Some(Absence::Covered)),
+        };
         let others = if self.augment { others } else { nothing };
-        let search = self.crop(&drawn.search, &config.search, &joint, &others, rng);
-        Sample { id: drawn.id.clone(), templates, search, cross: drawn.is_cross() }
+        let (frame, elsewhere) = match absence {
+            Some(Absence::Another(frame)) => (frame, true),
+            _ => (&drawn.search, false),
+        };
+        let (search, covered) = self.crop(frame, &config.search, &joint, &others, rng);
+        let present = !elsewhere && !covered;
+        Sample { id: drawn.id.clone(), templates, search, cross: drawn.is_cross(), present }
     }
 
+    /// The crop, and whether the target in it is covered.
     fn crop(
         &self,
         frame: &DrawnFrame,
@@ -161,7 +176,7 @@ impl Processor {
         joint: &Joint,
         others: &Others<'_>,
         rng: &mut impl Rng,
-    ) -> Crop {
+    ) -> (Crop, bool) {
         let (config, side) = (&self.config, self.spec.crop_side());
         let picture = frame.picture.as_ref();
         let bbox = if joint.mirror { flip_box(&frame.bbox, picture.width) } else { frame.bbox };
@@ -180,6 +195,7 @@ impl Processor {
             channels: picture.channels,
             data: window.cut(picture, side, joint.mirror),
         };
+        let covered = others.covered && paste::cover(&mut pixels, &bbox, rng);
         if let Some(other) = others.distractor {
             paste::distractor(&mut pixels, &bbox, other, rng);
         }
@@ -206,7 +222,8 @@ impl Processor {
         if mirror {
             bbox = flip_box(&bbox, side);
         }
-        Crop { pixels: self.normalise(&planes, mirror), bbox, modality: frame.at.modality }
+        let pixels = self.normalise(&planes, mirror);
+        (Crop { pixels, bbox, modality: frame.at.modality }, covered)
     }
 
     fn photometric(&self, modality: Modality, joint: &Joint) -> (&PhotometricConfig, bool) {

@@ -1,5 +1,6 @@
-//! Things from another picture in the search crop: a distractor beside the target, an occluder over
-//! part of it. The target's box stays what it was.
+//! Things that change what the search crop shows: a distractor beside the target, an occluder over part
+//! of it, both from another picture, and the target covered by what lies beside it. The target's box
+//! stays what it was.
 
 use super::augment::Pixels;
 use crate::sampler::DrawnFrame;
@@ -61,6 +62,58 @@ pub(super) fn occluder(
     let x = (other.width as f32 - fw) * draw();
     let y = (other.height as f32 - fh) * draw();
     paste(pixels, &to, other, &BBox::new(x, y, fw, fh));
+}
+
+/// Share of the target's width and height added on each side when it is covered: boxes are often tight.
+const COVER_MARGIN: f32 = 0.15;
+
+/// Copies over `target` (crop pixels) what lies beside it, as large as it is with a margin, with a soft
+/// edge. False, and nothing done, when there is no room beside it in the crop.
+pub(super) fn cover(pixels: &mut Pixels, target: &BBox, rng: &mut impl Rng) -> bool {
+    let side = pixels.side as f32;
+    let (mx, my) = (target.w * COVER_MARGIN, target.h * COVER_MARGIN);
+    // In whole pixels, so that nothing has to be resampled.
+    let low = |v: f32| v.floor().clamp(0.0, side) as i64;
+    let high = |v: f32| v.ceil().clamp(0.0, side) as i64;
+    let (left, right) = (low(target.x - mx), high(target.right() + mx));
+    let (top, bottom) = (low(target.y - my), high(target.bottom() + my));
+    let (w, h, side) = (right - left, bottom - top, pixels.side as i64);
+    // By its size to the left, right, up or down, and a little along the other axis.
+    let slide = |length: i64, share: f32| (length as f32 * share) as i64;
+    let mut places = [(-w, 0), (w, 0), (0, -h), (0, h)].map(|(dx, dy)| {
+        let along = 0.5 * (rng.random::<f32>() - 0.5);
+        if dx == 0 {
+            (slide(w, along).clamp(-left, side - right), dy)
+        } else {
+            (dx, slide(h, along).clamp(-top, side - bottom))
+        }
+    });
+    let first = rng.random_range(0..places.len());
+    places.rotate_left(first);
+    let fits = |low: i64, length: i64| low >= 0 && low + length <= side;
+    let Some((dx, dy)) =
+        places.into_iter().find(|(dx, dy)| fits(left + dx, w) && fits(top + dy, h))
+    else {
+        return false;
+    };
+    if w == 0 || h == 0 {
+        return false;
+    }
+    let channels = pixels.channels;
+    // The places do not overlap, so what is read is never what was written.
+    for y in top..bottom {
+        for x in left..right {
+            let edge = (x - left).min(right - 1 - x).min(y - top).min(bottom - 1 - y);
+            let share = ((edge + 1) as f32 / 3.0).min(1.0);
+            let at = |x: i64, y: i64| (y * side + x) as usize * channels;
+            let (to, from) = (at(x, y), at(x + dx, y + dy));
+            for c in 0..channels {
+                let (old, new) = (f32::from(pixels.data[to + c]), f32::from(pixels.data[from + c]));
+                pixels.data[to + c] = (old + (new - old) * share).round_ties_even() as u8;
+            }
+        }
+    }
+    true
 }
 
 /// Fills the pixels whose centres lie in `to` (crop pixels) with what is in `from` (pixels of
@@ -147,6 +200,29 @@ mod tests {
         let everywhere = BBox::new(0.0, 0.0, 64.0, 64.0);
         distractor(&mut full, &everywhere, &other(), &mut ChaCha8Rng::seed_from_u64(1));
         assert!(full.data.iter().all(|v| *v == 0));
+    }
+
+    #[test]
+    fn a_covered_target_looks_like_what_is_beside_it() {
+        // The second one has room on one side only, the third on none.
+        let targets = [(24.0, 24.0, 10.0, 12.0), (8.0, 2.0, 16.0, 48.0), (2.0, 2.0, 60.0, 60.0)];
+        for (i, (x, y, w, h)) in targets.into_iter().enumerate() {
+            let target = BBox::new(x, y, w, h);
+            for seed in 0..20 {
+                let mut pixels = blank();
+                for (j, v) in pixels.data.iter_mut().enumerate() {
+                    let (px, py) = ((j % 64) as f32 + 0.5, (j / 64) as f32 + 0.5);
+                    let inside = px > target.x
+                        && px < target.right()
+                        && py > target.y
+                        && py < target.bottom();
+                    *v = if inside { 255 } else { 40 + (j % 2) as u8 };
+                }
+                let done = cover(&mut pixels, &target, &mut ChaCha8Rng::seed_from_u64(seed));
+                assert_eq!(done, i < 2, "{target:?} seed {seed}");
+                assert_eq!(pixels.data.iter().all(|v| *v <= 41), done, "{target:?} seed {seed}");
+            }
+        }
     }
 
     #[test]

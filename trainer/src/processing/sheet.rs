@@ -8,7 +8,7 @@ use tsda_runtime::{BBox, Modality, ModelSpec};
 const GAP: usize = 4;
 
 /// One row per sample: its templates, then the search crop, with the target's box and, as a bar
-/// above each crop, the sensor (blue: RGB, orange: thermal).
+/// above each crop, the sensor (blue: RGB, orange: thermal). A grey box is where an absent target would be.
 pub fn contact_sheet(spec: &ModelSpec, samples: &[Sample]) -> RgbImage {
     let columns = samples.iter().map(|s| s.templates.len() + 1).max().unwrap_or(1);
     let cell = spec.crop_side() + GAP;
@@ -17,8 +17,11 @@ pub fn contact_sheet(spec: &ModelSpec, samples: &[Sample]) -> RgbImage {
     for (row, sample) in samples.iter().enumerate() {
         let crops = sample.templates.iter().chain([&sample.search]);
         for (column, crop) in crops.enumerate() {
-            let colour =
-                if column < sample.templates.len() { [80, 255, 80] } else { [255, 60, 60] };
+            let colour = match column < sample.templates.len() {
+                true => [80, 255, 80],
+                false if sample.present => [255, 60, 60],
+                false => [150, 150, 150],
+            };
             draw(&mut sheet, spec, crop, (GAP + column * cell, GAP + row * cell), Rgb(colour));
         }
     }

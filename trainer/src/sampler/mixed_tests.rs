@@ -268,6 +268,66 @@ fn others_come_from_another_sequence_and_the_same_sensor() {
 }
 
 #[test]
+fn absent_targets_and_mixed_templates_have_their_shares() {
+    let dir = tempfile::tempdir().unwrap();
+    every_kind(dir.path());
+    let config = SamplerConfig {
+        absent_p: 0.25,
+        mixed_templates_p: 0.5,
+        templates: 3,
+        ..Default::default()
+    };
+    let sources = [source(dir.path(), "pairs", 1.0), source(dir.path(), "sequences", 1.0)];
+    let drawn = draws(&open(&sources, &config).unwrap(), 600);
+    let share = |of: &dyn Fn(&Drawn) -> bool, among: &dyn Fn(&Drawn) -> bool| {
+        let among: Vec<_> = drawn.iter().filter(|d| among(d)).collect();
+        among.iter().filter(|d| of(d)).count() as f64 / among.len() as f64
+    };
+    assert!((share(&|d| d.absence.is_some(), &|_| true) - 0.25).abs() < 0.06);
+    let another = |d: &Drawn| matches!(d.absence, Some(Absence::Another(_)));
+    assert!((share(&another, &|d| d.absence.is_some()) - 0.5).abs() < 0.15);
+    for d in &drawn {
+        if let Some(Absence::Another(other)) = &d.absence {
+            assert_eq!(other.at.modality, d.search.at.modality);
+            assert_ne!(other.at.sequence, d.search.at.sequence);
+        }
+        let (first, rest) = d.templates.split_first().unwrap();
+        assert_eq!(d.is_cross(), first.at.modality != d.search.at.modality);
+        assert!(d.is_cross() || rest.iter().all(|t| t.at.modality == first.at.modality));
+    }
+    // Of two templates that may differ, one of four draws changes neither.
+    let mixed = |d: &Drawn| d.templates.iter().any(|t| t.at.modality == d.search.at.modality);
+    assert!((share(&mixed, &Drawn::is_cross) - 0.75).abs() < 0.08);
+}
+
+#[test]
+fn absent_targets_have_no_label_and_no_box_loss() {
+    let dir = tempfile::tempdir().unwrap();
+    every_kind(dir.path());
+    let config = SamplerConfig { absent_p: 1.0, ..Default::default() };
+    let sources = [source(dir.path(), "pairs", 1.0), source(dir.path(), "stills", 1.0)];
+    let spec = ModelSpec { crop: 64, ..ModelSpec::NANO };
+    let batch = |augment: bool, p: f64| {
+        let config = SamplerConfig { absent_p: p, ..config.clone() };
+        let processor = Processor::new(&spec, &ProcessingConfig::default(), augment);
+        BatchMaker::new(open(&sources, &config).unwrap(), processor, 7, 16).step(0).unwrap()
+    };
+    let absent = batch(true, 1.0);
+    let gone: Vec<_> = (0..16).filter(|i| !absent.present[*i]).collect();
+    // A covered target stays where nothing beside it has room.
+    assert!(gone.len() >= 8, "{gone:?}");
+    for i in gone {
+        let cells = i * spec.cells()..(i + 1) * spec.cells();
+        assert!(absent.search_labels[cells.clone()].iter().all(|v| *v == 0.0));
+        assert!(absent.region[cells].iter().all(|r| !r));
+    }
+    for all in [batch(false, 1.0), batch(true, 0.0)] {
+        assert!(all.present.iter().all(|p| *p));
+        assert!(all.search_labels.chunks(spec.cells()).any(|l| l.iter().any(|v| *v > 0.5)));
+    }
+}
+
+#[test]
 fn errors_name_the_entry() {
     let dir = tempfile::tempdir().unwrap();
     every_kind(dir.path());

@@ -122,7 +122,8 @@ pub struct DrawnFrame {
 pub struct Drawn {
     /// Name for logs: source, sequence, target or region, frames, sensors.
     pub id: String,
-    /// Template frames, all of one sensor.
+    /// Template frames, the first of the templates' sensor, the others too unless
+    /// `sampler.mixed_templates_p` is set.
     pub templates: Vec<DrawnFrame>,
     /// The frame to search.
     pub search: DrawnFrame,
@@ -133,6 +134,17 @@ pub struct Drawn {
     /// Frame of another sequence, part of which is to cover part of the target; of the search
     /// frame's sensor.
     pub occluder: Option<DrawnFrame>,
+    /// Is the search crop not to show the target, and how?
+    pub absence: Option<Absence>,
+}
+
+/// How a search crop comes to show no target.
+#[derive(Clone, Debug)]
+pub enum Absence {
+    /// The crop is cut around this target of another sequence instead; of the search frame's sensor.
+    Another(DrawnFrame),
+    /// What lies beside the target is copied over it.
+    Covered,
 }
 
 impl Drawn {
@@ -190,7 +202,8 @@ impl Sampler {
         }
         let mut sampler = Self::from_sources(opened, config, cache);
         if validation {
-            (sampler.config.distractor_p, sampler.config.occluder_p) = (0.0, 0.0);
+            let c = &mut sampler.config;
+            (c.distractor_p, c.occluder_p, c.absent_p, c.mixed_templates_p) = (0.0, 0.0, 0.0, 0.0);
         }
         Ok(sampler)
     }
@@ -255,6 +268,7 @@ impl Sampler {
                         self.draw_other(index, sequence, modality, self.config.distractor_p, rng)?;
                     drawn.occluder =
                         self.draw_other(index, sequence, modality, self.config.occluder_p, rng)?;
+                    drawn.absence = self.draw_absence(index, sequence, modality, rng)?;
                     return Ok(drawn);
                 }
                 last = self.sources[index].sequences[sequence].id();
@@ -325,6 +339,37 @@ impl Sampler {
         Ok(None)
     }
 
+    /// With chance `absent_p`, one of the two ways, each as often as the other.
+    fn draw_absence(
+        &self,
+        index: usize,
+        sequence: usize,
+        modality: Modality,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Absence>, SampleError> {
+        let p = self.config.absent_p;
+        if p <= 0.0 || !rng.random_bool(p) {
+            return Ok(None);
+        }
+        let another = self.draw_other(index, sequence, modality, 0.5, rng)?;
+        Ok(Some(another.map_or(Absence::Covered, Absence::Another)))
+    }
+
+    /// Sensor of every template: the first is `template`'s, the others' may be `search`'s where the
+    /// target was found `seen` there.
+    fn template_sensors<'a>(
+        &'a self,
+        (template, search): (Modality, Modality),
+        seen: impl Fn(usize) -> bool + 'a,
+        rng: &'a mut impl Rng,
+    ) -> impl Iterator<Item = Modality> + 'a {
+        let p = if template == search { 0.0 } else { self.config.mixed_templates_p };
+        (0..self.config.templates).map(move |i| {
+            let other = i > 0 && p > 0.0 && rng.random_bool(p) && seen(i);
+            if other { search } else { template }
+        })
+    }
+
     /// The frame with its picture; `None` when the box lies wholly outside of it.
     fn frame(
         &self,
@@ -371,7 +416,8 @@ impl Sampler {
             bbox.w,
             bbox.h
         );
-        let templates = (0..self.config.templates).map(|_| of(template, &first)).collect();
+        let one = |sensor| of(sensor, if sensor == template { &first } else { &second });
+        let templates = self.template_sensors((template, search), |_| true, rng).map(one).collect();
         Ok(Some(Drawn {
             id,
             templates,
@@ -379,6 +425,7 @@ impl Sampler {
             region: true,
             distractor: None,
             occluder: None,
+            absence: None,
         }))
     }
 
@@ -420,12 +467,27 @@ impl Sampler {
             None => Ok(None),
         };
         let mut templates = Vec::with_capacity(template_frames.len());
-        for frame in template_frames {
-            let Some(drawn) = of(frame, template)? else { return Ok(None) };
+        let sensors: Vec<Modality> = self
+            .template_sensors(
+                (template, search),
+                |i| seen(template_frames[i], search).is_some(),
+                rng,
+            )
+            .collect();
+        for (&frame, sensor) in template_frames.iter().zip(sensors) {
+            let Some(drawn) = of(frame, sensor)? else { return Ok(None) };
             templates.push(drawn);
         }
         let Some(search) = of(search_frame, search)? else { return Ok(None) };
-        Ok(Some(Drawn { id, templates, search, region: false, distractor: None, occluder: None }))
+        Ok(Some(Drawn {
+            id,
+            templates,
+            search,
+            region: false,
+            distractor: None,
+            occluder: None,
+            absence: None,
+        }))
     }
 }
 

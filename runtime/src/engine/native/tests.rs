@@ -4,11 +4,9 @@ mod bytes;
 
 use super::*;
 use crate::bundle::{
-    HEADER_LEN, Manifest, Provenance, Section, SectionKind as Kind, TrainedOn, WEIGHTS_FILE,
-    align_up, crc32, header,
+    HEADER_LEN, Manifest, Section, SectionKind as Kind, WEIGHTS_FILE, align_up, crc32, header,
 };
 use crate::probe;
-use crate::spec::TrackerParams;
 use proptest::prelude::*;
 
 /// A protobuf message that is being written.
@@ -183,20 +181,7 @@ fn parts() -> Vec<(Kind, Vec<u8>)> {
 }
 
 fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
-    let mut manifest = Manifest {
-        name: "tiny",
-        spec: SPEC,
-        tracker: TrackerParams::default(),
-        trained_on: TrainedOn::default(),
-        calibration: None,
-        provenance: Provenance::default(),
-        figures: Default::default(),
-        licence: "MIT",
-        card: "",
-        sections: Default::default(),
-        motion: None,
-        precision: None,
-    };
+    let mut manifest = Manifest { licence: "MIT", ..Manifest::new("tiny", SPEC) };
     let mut at = 4096;
     for (kind, bytes) in parts {
         let (offset, length) = (align_up(at).unwrap(), bytes.len() as u64);

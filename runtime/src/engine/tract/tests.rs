@@ -1,10 +1,7 @@
 //! A tiny network written by hand, so that every number can be computed here as well.
 
 use super::*;
-use crate::bundle::{
-    HEADER_LEN, Manifest, Provenance, Section, SectionKind as Kind, TrainedOn, align_up, crc32,
-    header,
-};
+use crate::bundle::{HEADER_LEN, Manifest, Section, SectionKind as Kind, align_up, crc32, header};
 use crate::probe;
 use crate::spec::TrackerParams;
 use crate::tracker::Tracker;
@@ -190,20 +187,7 @@ pub(in crate::engine) fn parts() -> Vec<(Kind, Vec<u8>)> {
 }
 
 pub(in crate::engine) fn write(parts: &[(Kind, Vec<u8>)]) -> Vec<u8> {
-    let mut manifest = Manifest {
-        name: "tiny",
-        spec: SPEC,
-        tracker: TrackerParams::default(),
-        trained_on: TrainedOn::default(),
-        calibration: None,
-        provenance: Provenance::default(),
-        figures: Default::default(),
-        licence: "MIT",
-        card: "",
-        sections: Default::default(),
-        motion: None,
-        precision: None,
-    };
+    let mut manifest = Manifest { licence: "MIT", ..Manifest::new("tiny", SPEC) };
     let mut at = 4096;
     for (kind, bytes) in parts {
         let (offset, length) = (align_up(at).unwrap(), bytes.len() as u64);
