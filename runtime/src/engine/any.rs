@@ -370,7 +370,12 @@ mod tests {
     #[cfg(feature = "native")]
     #[test]
     fn options_of_the_native_engine_are_read_and_written() {
-        for text in ["native", "native,threads=3", "native,threads=2,pin", "native,isa=scalar,attention=floats"] {
+        for text in [
+            "native",
+            "native,threads=3",
+            "native,threads=2,pin",
+            "native,isa=scalar,attention=floats",
+        ] {
             assert_eq!(text.parse::<EngineChoice>().unwrap().to_string(), text);
         }
         let one: EngineChoice = "native".parse().unwrap();

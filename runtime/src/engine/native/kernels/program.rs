@@ -3,8 +3,9 @@
 use super::attention::Attention;
 use super::eight::BYTES;
 use super::{
-    AttentionBytes, Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem,
-    PackKv, PackKvBytes, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
+    AttentionBytes, Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm,
+    MatMul, Mem, PackKv, PackKvBytes, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention,
+    Zip,
 };
 use crate::engine::native::sync::Barrier;
 use std::time::{Duration, Instant};

@@ -149,9 +149,11 @@ unsafe fn magnitude<S: Simd>(v: S::V) -> S::V {
     unsafe { S::at_least(v, S::sub(S::splat(0.0), v)) }
 }
 
-/// Mean of `count` rows from element `at` on, and the largest distance from it.
+/// Mean of `count` rows of at most a vector, and the largest distance from it.
 #[inline(always)]
 unsafe fn spread<S: Simd>(first: *const f32, row: usize, count: usize, lanes: usize) -> [S::V; 2] {
+    /// Sums that do not wait for each other.
+    const ABREAST: usize = 4;
     // SAFETY: the caller promises that many lanes of that many rows.
     unsafe {
         let whole = lanes == S::LANES;
@@ -159,10 +161,11 @@ unsafe fn spread<S: Simd>(first: *const f32, row: usize, count: usize, lanes: us
             let p = first.add(i * row);
             if whole { S::load(p) } else { S::load_n(p, lanes) }
         };
-        let mut sum = S::splat(0.0);
+        let mut sums = [S::splat(0.0); ABREAST];
         for i in 0..count {
-            sum = S::add(sum, load(i));
+            sums[i % ABREAST] = S::add(sums[i % ABREAST], load(i));
         }
+        let sum = S::add(S::add(sums[0], sums[1]), S::add(sums[2], sums[3]));
         let mean = S::mul(sum, S::splat(1.0 / count as f32));
         let mut most = S::splat(0.0);
         for i in 0..count {
@@ -210,43 +213,79 @@ unsafe fn pack_keys<D: Dot>(s: &PackKvBytes, keys: *const f32, out: *mut f32) {
             most = most.max(D::F::top(far));
         }
         *out.add(p.key_step) = most / MOST;
-        let (factor, zero) = (D::F::splat(inverse(most)), D::F::splat(ZERO));
+        let factor = D::F::splat(inverse(most));
         let width = MAX_VECTORS * lanes;
         for at in (0..key).step_by(lanes) {
             let n = lanes.min(key - at);
             let [mean, _] = spread::<D::F>(keys.add(at), s.key_row, count, n);
-            // Bytes behind the key's end are zero.
             let (first, groups) = (at / BYTES, Eight::floats(n));
             for j in 0..p.keys {
-                let mut bytes = [0x80u8; MAX_BYTES];
-                if j < count {
-                    let from = keys.add(j * s.key_row + at);
-                    let v = if n == lanes { D::F::load(from) } else { D::F::load_n(from, n) };
-                    let v = D::F::fma(D::F::sub(v, mean), factor, zero);
-                    if n == lanes {
-                        D::narrow(v, bytes.as_mut_ptr());
-                    } else {
-                        let mut all = [0u8; MAX_BYTES];
-                        D::narrow(v, all.as_mut_ptr());
-                        bytes[..n].copy_from_slice(&all[..n]);
-                    }
-                }
-                let mut sum = 0;
+                let words = if j < count {
+                    rounded::<D>(keys.add(j * s.key_row + at), n, mean, factor)
+                } else {
+                    [0; MAX_BYTES / BYTES]
+                };
                 let panel = j / width * width;
                 let columns = width.min(p.keys - panel);
-                for g in 0..groups {
-                    let mut four = [0u8; BYTES];
-                    for (b, four) in four.iter_mut().enumerate() {
-                        *four = bytes[g * BYTES + b] ^ 0x80;
-                        sum += i32::from(four.cast_signed());
-                    }
-                    let group = out.add(panel * p.groups + (first + g) * columns);
-                    put::<D>(group.add((j - panel) / lanes * lanes), j % lanes, four);
+                let to = out.add(panel * p.groups + (j - panel) / lanes * lanes);
+                for (g, word) in words.into_iter().enumerate().take(groups) {
+                    put::<D>(to.add((first + g) * columns), j % lanes, word);
                 }
-                // What the queries' zero adds, less what the kernel takes off by itself.
-                *starts.add(j) -= (ZERO as i32 - D::SHIFT) * sum;
             }
         }
+        // What the queries' zero will add, taken off beforehand.
+        let zero = f32::from_bits(u32::from_ne_bytes([ZERO as u8; BYTES]));
+        for at in (0..p.keys).step_by(lanes) {
+            let panel = at / width * width;
+            let columns = width.min(p.keys - panel);
+            let vectors = out.add(panel * p.groups + (at - panel));
+            take_off::<D>(zero, vectors, columns, p.groups, starts.add(at));
+        }
+    }
+}
+
+/// Subtracts from every lane the sum of `groups` products with these four bytes.
+#[inline(always)]
+unsafe fn take_off<D: Dot>(
+    bytes: f32,
+    vectors: *const f32,
+    pitch: usize,
+    groups: usize,
+    starts: *mut i32,
+) {
+    // SAFETY: the caller promises that many vectors, `pitch` apart, and one more of starts.
+    unsafe {
+        let (x, mut sum) = (D::bytes(&bytes), D::zero());
+        for g in 0..groups {
+            sum = D::dot(sum, x, D::weights(vectors.add(g * pitch)));
+        }
+        let mut sums = [0; MAX_BYTES];
+        D::store(sums.as_mut_ptr(), sum);
+        for (lane, sum) in sums.iter().enumerate().take(D::F::LANES) {
+            *starts.add(lane) -= sum;
+        }
+    }
+}
+
+/// `n` numbers, at most a vector, less their mean, as signed bytes; zeros behind them.
+#[inline(always)]
+unsafe fn rounded<D: Dot>(
+    from: *const f32,
+    n: usize,
+    mean: <D::F as Simd>::V,
+    factor: <D::F as Simd>::V,
+) -> [u32; MAX_BYTES / BYTES] {
+    // SAFETY: the caller promises that many numbers and the instruction set.
+    unsafe {
+        let whole = n == D::F::LANES;
+        let v = if whole { D::F::load(from) } else { D::F::load_n(from, n) };
+        let v = D::F::fma(D::F::sub(v, mean), factor, D::F::splat(ZERO));
+        let mut words = [SIGNS; MAX_BYTES / BYTES];
+        D::narrow(v, words.as_mut_ptr().cast());
+        if !whole {
+            words.as_mut_ptr().cast::<u8>().add(n).write_bytes(ZERO as u8, MAX_BYTES - n);
+        }
+        words.map(|word| word ^ SIGNS)
     }
 }
 
@@ -267,54 +306,67 @@ unsafe fn pack_values<D: Dot>(s: &PackKvBytes, values: *const f32, out: *mut f32
             let mut factors = [0.0; MAX_BYTES];
             D::F::store(factors.as_mut_ptr(), far);
             factors.iter_mut().for_each(|f| *f = inverse(*f));
-            let (factor, zero) = (D::F::load(factors.as_ptr()), D::F::splat(ZERO));
+            let factor = D::F::load(factors.as_ptr());
             let panel = at / width * width;
             let columns = width.min(p.value - panel);
             let to = out.add(p.values + panel * (p.keys / BYTES) + (at - panel));
-            let mut sums = [0i32; MAX_BYTES];
             for group in 0..p.keys / BYTES {
-                let mut four = [[0x80u8; MAX_BYTES]; BYTES];
-                for (b, four) in four.iter_mut().enumerate() {
+                let mut rows = [[0u32; MAX_BYTES / BYTES]; BYTES];
+                for (b, row) in rows.iter_mut().enumerate() {
                     let j = group * BYTES + b;
                     if j < count {
-                        let from = values.add(j * s.value_row + at);
-                        let v = if n == lanes { D::F::load(from) } else { D::F::load_n(from, n) };
-                        D::narrow(
-                            D::F::fma(D::F::sub(v, mean), factor, zero),
-                            four.as_mut_ptr(),
-                        );
+                        *row = rounded::<D>(values.add(j * s.value_row + at), n, mean, factor);
                     }
                 }
+                let rows = rows.map(|row| bytes_of(row));
+                let mut words = [0u32; MAX_BYTES];
+                for (lane, word) in words.iter_mut().enumerate() {
+                    *word = u32::from_ne_bytes([
+                        rows[0][lane],
+                        rows[1][lane],
+                        rows[2][lane],
+                        rows[3][lane],
+                    ]);
+                }
                 let vector = to.add(group * columns);
-                for lane in 0..lanes {
-                    let bytes = four.map(|row| row[lane] ^ 0x80);
-                    if D::SHIFT != 0 {
-                        sums[lane] += bytes.iter().map(|b| i32::from(b.cast_signed())).sum::<i32>();
-                    }
-                    put::<D>(vector, lane, bytes);
+                for (lane, word) in words.into_iter().enumerate().take(lanes) {
+                    put::<D>(vector, lane, word);
                 }
             }
             let starts = out.add(p.value_starts + at).cast::<i32>();
-            for (lane, sum) in sums.iter().enumerate().take(lanes) {
-                *starts.add(lane) = D::SHIFT * sum;
+            for lane in 0..lanes {
+                *starts.add(lane) = 0;
             }
+            take_off::<D>(0.0, to, columns, p.keys / BYTES, starts);
         }
     }
 }
 
+const fn bytes_of(words: [u32; MAX_BYTES / BYTES]) -> [u8; MAX_BYTES] {
+    let mut bytes = [0; MAX_BYTES];
+    let mut i = 0;
+    while i < MAX_BYTES {
+        bytes[i] = words[i / BYTES].to_ne_bytes()[i % BYTES];
+        i += 1;
+    }
+    bytes
+}
+
 /// Most bytes that a vector of floats is narrowed to.
 const MAX_BYTES: usize = 16;
+/// The sign bits of four bytes.
+const SIGNS: u32 = 0x8080_8080;
 
 /// Four rows of a column into the vector at `p`.
 #[inline(always)]
-unsafe fn put<D: Dot>(p: *mut f32, lane: usize, four: [u8; BYTES]) {
+unsafe fn put<D: Dot>(p: *mut f32, lane: usize, four: u32) {
     // SAFETY: the caller promises a whole vector.
     unsafe {
         if D::LAYOUT == Layout::Quads {
-            *p.add(lane) = f32::from_bits(u32::from_ne_bytes(four));
+            *p.add(lane) = f32::from_bits(four);
             return;
         }
-        for (row, byte) in four.into_iter().enumerate() {
+        for (row, byte) in four.to_ne_bytes().into_iter().enumerate() {
             *p.cast::<u8>().add(D::LAYOUT.at(D::F::LANES, lane, row)) = byte;
         }
     }
@@ -501,13 +553,7 @@ unsafe fn logits<D: Dot, const R: usize, const NV: usize>(
 
 /// `255 * 2^(factor * (sum - top))` as bytes; returns one over the sum of these before rounding.
 #[inline(always)]
-unsafe fn weigh<D: Dot>(
-    sums: *const i32,
-    keys: usize,
-    factor: f32,
-    top: i32,
-    to: *mut u8,
-) -> f32 {
+unsafe fn weigh<D: Dot>(sums: *const i32, keys: usize, factor: f32, top: i32, to: *mut u8) -> f32 {
     /// Logarithm of the largest weight.
     const LOG2_255: f32 = 7.994_353;
     // SAFETY: as for `attend`; there is room for whole vectors of keys.

@@ -35,11 +35,12 @@ fn packed(pixels: usize, channels: usize, pixel: usize, seed: usize) -> Vec<f32>
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: CASES, ..ProptestConfig::default() })]
 
     #[test]
     fn products_of_bytes(
-        (h, w, c, n) in (1usize..6, 1usize..9, 1usize..23, 1usize..71),
+        (h, w, c, n) in
+            (1usize..6, 1usize..miri(4, 9), 1usize..miri(7, 23), 1usize..miri(19, 71)),
         (kernel, stride) in (prop::sample::select(vec![1usize, 3]), 1usize..3),
         (gap, with, swish, threads) in (0usize..3, 0usize..4, any::<bool>(), 1usize..4),
     ) {
@@ -172,8 +173,8 @@ proptest! {
     /// so the tolerance is that of steps; `flat` makes all weights nearly equal.
     #[test]
     fn attention_of_bytes(
-        (queries, keys) in (1usize..QUERIES, 1usize..70),
-        (heads, key, value) in (1usize..4, 1usize..40, 1usize..40),
+        (queries, keys) in (1usize..QUERIES, 1usize..miri(20, 70)),
+        (heads, key, value) in (1usize..miri(3, 4), 1usize..miri(12, 40), 1usize..miri(12, 40)),
         (gap, threads, flat) in (0usize..5, 1usize..4, any::<bool>()),
     ) {
         let (row, out_row) = (heads * key.max(value) + gap, heads * value + gap);
@@ -245,7 +246,7 @@ proptest! {
 /// Every instruction set must come to the same bytes but where a number lies between two steps.
 #[test]
 fn instruction_sets_round_attention_alike() {
-    let (heads, queries, keys, size) = (2, 29, 53, 24);
+    let (heads, queries, keys, size) = (2, miri(7, 29), miri(19, 53), miri(8, 24));
     let row = 3 * heads * size;
     let input = numbers(keys * row, 9);
     let mut first: Option<Vec<f32>> = None;
