@@ -14,23 +14,6 @@ fn vectors<S: Simd>(n: usize, mut f: impl FnMut(usize, usize)) {
     }
 }
 
-/// As [`vectors`], every other one with `i` 1: two sums that do not wait for each other, and code of
-/// their own for whole vectors.
-#[inline(always)]
-fn halves<S: Simd>(n: usize, mut f: impl FnMut(usize, usize, usize)) {
-    let mut at = 0;
-    while at + 2 * S::LANES <= n {
-        f(0, at, S::LANES);
-        f(1, at + S::LANES, S::LANES);
-        at += 2 * S::LANES;
-    }
-    while at < n {
-        let lanes = (n - at).min(S::LANES);
-        f(0, at, lanes);
-        at += lanes;
-    }
-}
-
 #[inline(always)]
 unsafe fn load<S: Simd>(p: *const f32, lanes: usize) -> S::V {
     // SAFETY: the caller promises that many floats and the instruction set.
@@ -88,18 +71,17 @@ pub unsafe fn layer_norm<S: Simd>(s: &LayerNorm, mem: Mem, part: Part) {
             let (y, x) = (row / s.size[1], row % s.size[1]);
             let from = mem.at(s.input).add(y * s.input_pitch.y + x * s.input_pitch.x);
             let to = mem.arena.add(s.output + y * s.output_pitch.y + x * s.output_pitch.x);
-            let mut sum = [S::splat(0.0); 2];
-            halves::<S>(n, |i, at, lanes| sum[i] = S::add(sum[i], load::<S>(from.add(at), lanes)));
-            let mean = S::sum(S::add(sum[0], sum[1])) / n as f32;
+            let mut sum = S::splat(0.0);
+            vectors::<S>(n, |at, lanes| sum = S::add(sum, load::<S>(from.add(at), lanes)));
+            let mean = S::sum(sum) / n as f32;
             let (means, mean) = ([mean; 16], S::splat(mean));
-            let mut squares = [S::splat(0.0); 2];
-            halves::<S>(n, |i, at, lanes| {
+            let mut squares = S::splat(0.0);
+            vectors::<S>(n, |at, lanes| {
                 let d = deviation::<S>(from.add(at), lanes, mean, means.as_ptr());
-                squares[i] = S::fma(d, d, squares[i]);
+                squares = S::fma(d, d, squares);
             });
-            let squares = S::sum(S::add(squares[0], squares[1]));
-            let factor = S::splat(1.0 / (squares / n as f32 + s.epsilon).sqrt());
-            halves::<S>(n, |_, at, lanes| {
+            let factor = S::splat(1.0 / (S::sum(squares) / n as f32 + s.epsilon).sqrt());
+            vectors::<S>(n, |at, lanes| {
                 let d = S::sub(load::<S>(from.add(at), lanes), mean);
                 let g = load::<S>(gain.add(at), lanes);
                 let o = match s.offset {
