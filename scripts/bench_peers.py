@@ -213,7 +213,10 @@ def run_tsda(program, bundles, threads, frames):
             print(f"left out: {' '.join(command)}: exit {done.returncode}", file=sys.stderr)
             continue
         for row in json.loads(done.stdout)["engines"]:
-            name = f"tsda {row['engine']} {row.get('preset', '')}".strip()
+            # Two bundles of one preset, such as one of floats and one of bytes, stay apart.
+            file = pathlib.Path(bundle).stem if bundle else ""
+            words = ["tsda", row["engine"], file, row.get("preset", "")]
+            name = " ".join(dict.fromkeys(w for w in words if w))
             if "unavailable" in row:
                 print(f"left out: {name}: {row['unavailable']}", file=sys.stderr)
             else:

@@ -48,7 +48,7 @@ echo "== host: parity of the engines on the shipped model"
 cargo build --locked -p tsda-host "${features[@]}" --target "$target"
 tsda="$CARGO_TARGET_DIR/$target/debug/tsda"
 for engine in native native,threads=2 native,isa=scalar; do
-    $CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER "$tsda" verify --engine "$engine"
+    $CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER "$tsda" verify --no-times --engine "$engine"
 done
-[ "${features[2]}" = embed ] || $CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER "$tsda" verify
+[ "${features[2]}" = embed ] || $CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER "$tsda" verify --no-times
 echo "aarch64: passed"

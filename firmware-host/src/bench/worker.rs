@@ -171,12 +171,13 @@ impl Bench {
             _ => None,
         };
         // Every frame counts as found and is remembered, so that writes are in the figures.
-        let mut params = bundle.manifest().tracker;
-        params.not_found = 0.0;
-        params.write_confidence = 0.0;
-        let templates = bundle.manifest().spec.templates;
-        let preset = bundle.manifest().name.to_owned();
-        let tracker = Tracker::new(Timed::new(engine), params).map_err(failed)?;
+        let mut manifest = bundle.manifest().clone();
+        manifest.tracker.not_found = 0.0;
+        manifest.tracker.write_confidence = 0.0;
+        let templates = manifest.spec.templates;
+        let preset = manifest.name.to_owned();
+        let tracker = Tracker::from_manifest(Timed::new(engine), &manifest).map_err(failed)?;
+        drop(manifest);
         drop(bundle);
         drop(file);
         let span = start.since();

@@ -204,6 +204,9 @@ pub struct VerifyArgs {
     /// Only this engine (docs/engines.md) [default: every one of this build that is on the machine]
     #[arg(long, value_name = "ENGINE")]
     pub engine: Option<EngineChoice>,
+    /// Do not time the graphs afterwards, which takes minutes under an emulator
+    #[arg(long)]
+    pub no_times: bool,
 }
 
 /// Arguments of `tsda eval`.

@@ -34,7 +34,9 @@ pub(super) fn run(args: &VerifyArgs) -> Result<u8, HostError> {
         let name = choice.to_string();
         let outcome = model::engine(&file, &bundle, choice).and_then(|mut engine| {
             good &= check(&file, &mut engine, &probe, tolerance)?;
-            times += &stage_table(file.path(), &mut engine, &format!("{name:<8} "))?;
+            if !args.no_times {
+                times += &stage_table(file.path(), &mut engine, &format!("{name:<8} "))?;
+            }
             Ok(())
         });
         match outcome {

@@ -190,10 +190,10 @@ fn native_threads(threads: usize) -> Result<usize, String> {
     }
 }
 
-/// Reads `,threads=N,pin,isa=NAME`.
+/// Reads `,threads=N,pin,isa=NAME,attention=floats`.
 #[cfg(feature = "native")]
 fn native_options(text: &str) -> Result<NativeOptions, String> {
-    const KNOWN: &str = "threads=N, pin and isa=NAME are";
+    const KNOWN: &str = "threads=N, pin, isa=NAME and attention=floats are";
     let mut options = NativeOptions::default();
     if text.starts_with(':') {
         return Err(format!("it has no providers; {KNOWN} possible after a comma"));
@@ -211,6 +211,7 @@ fn native_options(text: &str) -> Result<NativeOptions, String> {
                     format!("this processor has {}, not `{name}`", names.join(", "))
                 })?);
             }
+            Some(("attention", "floats")) => options.float_attention = true,
             None if part == "pin" => options.pin = true,
             _ => return Err(format!("`{part}` is not known; {KNOWN}")),
         }
@@ -269,7 +270,10 @@ impl fmt::Display for EngineChoice {
                 if options.pin {
                     f.write_str(",pin")?;
                 }
-                options.isa.map_or(Ok(()), |isa| write!(f, ",isa={}", isa.name()))
+                if let Some(isa) = options.isa {
+                    write!(f, ",isa={}", isa.name())?;
+                }
+                f.write_str(if options.float_attention { ",attention=floats" } else { "" })
             }
             #[cfg(feature = "tract")]
             Self::Tract(options) => {
@@ -366,7 +370,12 @@ mod tests {
     #[cfg(feature = "native")]
     #[test]
     fn options_of_the_native_engine_are_read_and_written() {
-        for text in ["native", "native,threads=3", "native,threads=2,pin", "native,isa=scalar"] {
+        for text in [
+            "native",
+            "native,threads=3",
+            "native,threads=2,pin",
+            "native,isa=scalar,attention=floats",
+        ] {
             assert_eq!(text.parse::<EngineChoice>().unwrap().to_string(), text);
         }
         let one: EngineChoice = "native".parse().unwrap();

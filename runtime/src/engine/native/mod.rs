@@ -39,6 +39,8 @@ pub struct NativeOptions {
     pub pin: bool,
     /// Instruction set; `None` takes the best one of this processor.
     pub isa: Option<Isa>,
+    /// Whether attention stays in floats where the products around it are of bytes.
+    pub float_attention: bool,
 }
 
 impl NativeOptions {
@@ -48,7 +50,7 @@ impl NativeOptions {
 
 impl Default for NativeOptions {
     fn default() -> Self {
-        Self { threads: 1, pin: false, isa: None }
+        Self { threads: 1, pin: false, isa: None, float_attention: false }
     }
 }
 
@@ -184,6 +186,9 @@ impl NativeEngine {
         let graphs = Graphs::read(bundle, spec.templates)?;
         let weights = bundle.section(SectionKind::Weights).unwrap_or_default().len() / 4;
         let mut planner = Planner::new(kernels, threads, weights + weights / 16, bundle.mapping());
+        if !options.float_attention {
+            planner.narrow_attention();
+        }
         let places = Self::lower(&mut planner, &spec, &graphs)?;
         let plan = planner.finish().map_err(|e| error(Stage::Load, format_args!("{e}")))?;
         drop(graphs);

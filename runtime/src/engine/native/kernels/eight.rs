@@ -2,10 +2,14 @@
 //! bits, results floats. Four neighbouring numbers share the place of one float, so a product of
 //! bytes is a [`Gemm`] whose rows are a quarter as long: addresses, windows and panels are the same.
 
+mod attention;
+
 use super::gemm::{Packing, Tile, TileFn};
 use super::simd::{Simd, hard_swish};
 use super::table::{MAX_ROWS, MAX_VECTORS};
 use super::{Halo, Mem, Part, Pitch, Place};
+
+pub use attention::{AttentionBytes, PackKvBytes, attend, pack as pack_kv};
 
 /// Bytes in the place of a float.
 pub const BYTES: usize = 4;
@@ -45,6 +49,8 @@ pub struct Eight {
     pub shift: i32,
     pub(super) tiles: [[TileFn; MAX_ROWS]; MAX_VECTORS],
     pub(super) quantise: unsafe fn(&Quantise, Mem, Part),
+    pub(super) pack_kv: unsafe fn(&PackKvBytes, Mem, Part),
+    pub(super) attend: unsafe fn(&AttentionBytes, Mem, Part),
 }
 
 impl Eight {
@@ -132,7 +138,17 @@ pub trait Dot {
     unsafe fn dot(sum: Self::I, x: Self::X, w: Self::W) -> Self::I;
     /// The sums as floats.
     unsafe fn floats(sum: Self::I) -> <Self::F as Simd>::V;
-    /// Writes as many bytes as there are lanes, of whole numbers from 0 to 255.
+    /// The same number in all lanes.
+    unsafe fn all(n: i32) -> Self::I;
+    /// As many sums as there are lanes.
+    unsafe fn load(p: *const i32) -> Self::I;
+    /// Writes all lanes.
+    unsafe fn store(p: *mut i32, sum: Self::I);
+    /// The larger in every lane.
+    unsafe fn larger(a: Self::I, b: Self::I) -> Self::I;
+    /// Largest lane.
+    unsafe fn top(sum: Self::I) -> i32;
+    /// Writes as many bytes as there are lanes, of numbers from 0 to 255 rounded to whole ones.
     unsafe fn narrow(v: <Self::F as Simd>::V, to: *mut u8);
 }
 
@@ -297,10 +313,32 @@ impl Dot for ScalarDot {
         sum.map(|n| n as f32)
     }
     #[inline(always)]
+    unsafe fn all(n: i32) -> Self::I {
+        [n; _]
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const i32) -> Self::I {
+        // SAFETY: the caller promises that all lanes can be read.
+        unsafe { p.cast::<Self::I>().read_unaligned() }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut i32, sum: Self::I) {
+        // SAFETY: the caller promises that all lanes can be written.
+        unsafe { p.cast::<Self::I>().write_unaligned(sum) }
+    }
+    #[inline(always)]
+    unsafe fn larger(a: Self::I, b: Self::I) -> Self::I {
+        core::array::from_fn(|i| a[i].max(b[i]))
+    }
+    #[inline(always)]
+    unsafe fn top(sum: Self::I) -> i32 {
+        sum.into_iter().fold(i32::MIN, i32::max)
+    }
+    #[inline(always)]
     unsafe fn narrow(v: <Self::F as Simd>::V, to: *mut u8) {
         for (i, x) in v.into_iter().enumerate() {
             // SAFETY: the caller promises room for all lanes.
-            unsafe { *to.add(i) = x as u8 };
+            unsafe { *to.add(i) = x.round_ties_even() as u8 };
         }
     }
 }

@@ -145,9 +145,12 @@ impl Tile {
         residual: false,
         factors: core::ptr::null(),
         swish: false,
-        clamp: (f32::NEG_INFINITY, f32::INFINITY),
+        clamp: UNLIMITED,
     };
 }
+
+/// Limits that change nothing.
+const UNLIMITED: (f32, f32) = (f32::NEG_INFINITY, f32::INFINITY);
 
 /// Terms that are summed before the sum goes to a total of such sums: rounding errors grow with the
 /// number of terms, and the deepest convolutions have 9,216.
@@ -167,6 +170,14 @@ pub unsafe fn tile<S: Simd, const R: usize, const NV: usize>(t: &Tile) {
         let total: *mut f32 = total.as_mut_ptr().cast();
         let place = |r: usize, j: usize| total.add((r * NV + j) * MAX_LANES);
         let (mut folded, mut summed) = (false, 0);
+        // Lines of the residual lie a row apart, where no processor foresees them.
+        if t.residual {
+            for r in 0..R {
+                for j in 0..NV {
+                    S::prefetch(t.r[r].wrapping_add(t.column + j * S::LANES));
+                }
+            }
+        }
         let mut b = t.b;
         for tap in 0..t.tap_count {
             let offset = *t.taps.add(tap);
@@ -246,11 +257,17 @@ pub unsafe fn tile<S: Simd, const R: usize, const NV: usize>(t: &Tile) {
                     }
                 }
             }
-            let (low, high) = (S::splat(t.clamp.0), S::splat(t.clamp.1));
+            if t.clamp != UNLIMITED {
+                let (low, high) = (S::splat(t.clamp.0), S::splat(t.clamp.1));
+                for r in 0..R {
+                    for j in 0..NV {
+                        acc[r][j] = S::at_most(high, S::at_least(low, acc[r][j]));
+                    }
+                }
+            }
             for r in 0..R {
                 for j in 0..NV {
-                    let y = S::at_most(high, S::at_least(low, acc[r][j]));
-                    S::store(t.c[r].add(t.column + j * S::LANES), y);
+                    S::store(t.c[r].add(t.column + j * S::LANES), acc[r][j]);
                 }
             }
             return;

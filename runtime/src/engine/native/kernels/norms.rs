@@ -231,7 +231,7 @@ pub unsafe fn softmax<S: Simd>(s: &Softmax, mem: Mem, part: Part) {
     }
 }
 
-/// `exp(scale * (x - max))` of `rows` rows of `n`, in place; the inverted sums go to `factors`.
+/// `e^(scale * (x - max))` of `rows` rows of `n`, in place; the inverted sums go to `factors`.
 /// `scale` is positive.
 ///
 /// # Safety
@@ -247,7 +247,7 @@ pub unsafe fn weigh<S: Simd>(
 ) {
     // SAFETY: as promised by the caller.
     unsafe {
-        let scale = S::splat(scale);
+        let scale = S::splat(scale * core::f32::consts::LOG2_E);
         for row in 0..rows {
             let p = first.add(row * pitch);
             let whole = n / S::LANES * S::LANES;
@@ -275,7 +275,7 @@ pub unsafe fn weigh<S: Simd>(
             let mut at = 0;
             while at < whole {
                 let v = S::fma(S::load(p.add(at)), scale, shift);
-                let e = simd::exp::<S>(v);
+                let e = simd::exp2::<S>(v);
                 sum = S::add(sum, e);
                 S::store(p.add(at), e);
                 at += S::LANES;
@@ -284,7 +284,7 @@ pub unsafe fn weigh<S: Simd>(
             if at < n {
                 let lanes = n - at;
                 let v = S::fma(S::load_n(p.add(at), lanes), scale, shift);
-                S::store_n(p.add(at), simd::exp::<S>(v), lanes);
+                S::store_n(p.add(at), simd::exp2::<S>(v), lanes);
                 total += S::sum(S::load_n(p.add(at), lanes));
             }
             *factors.add(row) = 1.0 / total;

@@ -3,8 +3,9 @@
 use super::attention::Attention;
 use super::eight::BYTES;
 use super::{
-    Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem,
-    PackKv, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
+    AttentionBytes, Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm,
+    MatMul, Mem, PackKv, PackKvBytes, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention,
+    Zip,
 };
 use crate::engine::native::sync::Barrier;
 use std::time::{Duration, Instant};
@@ -45,6 +46,10 @@ pub enum Step {
     PackKv(PackKv),
     /// Attention over panels.
     Attention(Attention),
+    /// Keys and values into panels of bytes.
+    PackKvBytes(PackKvBytes),
+    /// Attention over panels of bytes.
+    AttentionBytes(AttentionBytes),
     /// Attention of few queries.
     ThinAttention(ThinAttention),
 }
@@ -142,6 +147,8 @@ impl Step {
             Self::MapNorm(_) => "map norm",
             Self::PackKv(_) => "pack keys and values",
             Self::Attention(_) => "attention",
+            Self::PackKvBytes(_) => "keys and values to bytes",
+            Self::AttentionBytes(_) => "attention of bytes",
             Self::ThinAttention(_) => "attention of one query",
         }
     }
@@ -167,6 +174,10 @@ impl Step {
             Self::MapNorm(s) => 8 * s.size[0] * s.size[1] * s.channels,
             Self::PackKv(s) => 4 * s.heads.len() * s.size[0] * (s.size[1] + s.size[2]),
             Self::Attention(s) => {
+                s.heads.len() * s.queries * s.size[0] * (2 * (s.size[1] + s.size[2]) + 16)
+            }
+            Self::PackKvBytes(s) => 8 * s.heads.len() * s.size[0] * (s.size[1] + s.size[2]),
+            Self::AttentionBytes(s) => {
                 s.heads.len() * s.queries * s.size[0] * (2 * (s.size[1] + s.size[2]) + 16)
             }
             Self::ThinAttention(s) => {
@@ -264,6 +275,17 @@ impl Step {
                 at(&mut s.output);
             }
             Self::Attention(s) => {
+                place(&mut s.input);
+                at(&mut s.panels);
+                at(&mut s.output);
+                at(&mut s.scratch);
+            }
+            Self::PackKvBytes(s) => {
+                place(&mut s.keys);
+                place(&mut s.values);
+                at(&mut s.output);
+            }
+            Self::AttentionBytes(s) => {
                 place(&mut s.input);
                 at(&mut s.panels);
                 at(&mut s.output);
@@ -382,6 +404,28 @@ impl Step {
                 let apart = blocks(starts, s.queries, s.output_row, value);
                 spans.demand(apart, "its results overlap");
             }
+            Self::PackKvBytes(s) => {
+                let [count, key, value] = s.size;
+                spans.read(s.keys, farthest(&s.heads, 0) + (count - 1) * s.key_row + key);
+                spans.read(s.values, farthest(&s.heads, 1) + (count - 1) * s.value_row + value);
+                spans.write(s.output, s.heads.len() * PackKvBytes::len(s.size, &k.eight));
+            }
+            Self::AttentionBytes(s) => {
+                let [_, key, value] = s.size;
+                let queries = (s.queries - 1) * s.input_row + key;
+                spans.read(s.input, farthest(&s.heads, 0) + queries);
+                let panels = s.heads.len() * PackKvBytes::len(s.size, &k.eight);
+                spans.read(Place::Arena(s.panels), panels);
+                let results = (s.queries - 1) * s.output_row + value;
+                spans.write(s.output, farthest(&s.heads, 1) + results);
+                spans.write(s.scratch, threads * AttentionBytes::scratch_len(s.size, &k.eight));
+                let starts = s.heads.iter().map(|h| h[1]);
+                let apart = blocks(starts, s.queries, s.output_row, value);
+                spans.demand(apart, "its results overlap");
+                // Sums of products of bytes must stay away from the ends of their range.
+                let deep = key.max(s.size[0]) <= AttentionBytes::DEEPEST;
+                spans.demand(deep, "its sums could overflow");
+            }
             Self::ThinAttention(s) => {
                 let [keys, key, value] = s.size;
                 for (i, (n, run)) in
@@ -426,6 +470,8 @@ impl Step {
                 Self::MapNorm(s) => (k.map_norm)(s, mem, part),
                 Self::PackKv(s) => s.run(k, mem, part),
                 Self::Attention(s) => k.attention(s, mem, part),
+                Self::PackKvBytes(s) => (k.eight.pack_kv)(s, mem, part),
+                Self::AttentionBytes(s) => (k.eight.attend)(s, mem, part),
                 Self::ThinAttention(s) => (k.thin_attention)(s, mem, part),
             }
         }

@@ -41,20 +41,21 @@ pub trait Simd: Copy {
     unsafe fn sum(v: Self::V) -> f32;
     /// Largest lane.
     unsafe fn top(v: Self::V) -> f32;
+    /// Asks for the line at `p`, wherever that is, before it is needed.
+    #[inline(always)]
+    unsafe fn prefetch(_p: *const f32) {}
 }
 
-/// `e^x` for `x <= 0`, within 2e-7 of the value; below -87 it stays at `e^-87`, about 1e-38.
+/// `2^x` for `x <= 0`, within 3e-7 of the value; below -126 it stays at `2^-126`, about 1e-38.
 #[inline(always)]
-pub unsafe fn exp<S: Simd>(x: S::V) -> S::V {
+pub unsafe fn exp2<S: Simd>(x: S::V) -> S::V {
     // SAFETY: the caller promises the instruction set.
     unsafe {
-        let x = S::at_least(S::splat(-87.0), x);
-        let n = S::round(S::mul(x, S::splat(core::f32::consts::LOG2_E)));
-        // x - n ln 2, with ln 2 in two parts so that nothing is lost.
-        let r = S::fma(n, S::splat(-0.693_359_4), x);
-        let r = S::fma(n, S::splat(2.121_944_4e-4), r);
-        let mut p = S::splat(1.398_2e-3);
-        for c in [8.333_452e-3, 4.166_579_6e-2, 1.666_666_6e-1, 0.5, 1.0, 1.0] {
+        let x = S::at_least(S::splat(-126.0), x);
+        let n = S::round(x);
+        let r = S::sub(x, n);
+        let mut p = S::splat(1.327_640_7e-3);
+        for c in [9.675_541e-3, 5.550_713_5e-2, 2.402_212e-1, 6.931_469_4e-1, 1.000_000_1] {
             p = S::fma(p, r, S::splat(c));
         }
         S::scale2(p, n)

@@ -2,7 +2,7 @@
 
 use super::attention::{self, Attention, ThinAttention};
 use super::conv::{self, Depthwise, Pool};
-use super::eight::{self, Dot, Eight, Quantise, ScalarDot};
+use super::eight::{self, AttentionBytes, Dot, Eight, PackKvBytes, Quantise, ScalarDot};
 use super::gemm::{self, Packing, Tile, TileFn};
 use super::loops::{self, Copy, Fold, Map, Zip};
 use super::matmul::{self, MatMul};
@@ -198,6 +198,10 @@ macro_rules! table {
             table!(@one $feature tile[R, NV](t: &Tile) => eight::tile::<$dot, R, NV>(t));
             table!(@one $feature quantise[](s: &Quantise, m: Mem, p: Part)
                 => eight::quantise::<$dot>(s, m, p));
+            table!(@one $feature pack_kv[](s: &PackKvBytes, m: Mem, p: Part)
+                => eight::pack_kv::<$dot>(s, m, p));
+            table!(@one $feature attend[](s: &AttentionBytes, m: Mem, p: Part)
+                => eight::attend::<$dot, $rows>(s, m, p));
 
             const fn tiles<const NV: usize>() -> [TileFn; MAX_ROWS] {
                 table!(@rows $rows, NV)
@@ -213,6 +217,8 @@ macro_rules! table {
                 shift: <$dot as Dot>::SHIFT,
                 tiles: [tiles::<1>(), tiles::<2>()],
                 quantise,
+                pack_kv,
+                attend,
             };
         }
         use $module::EIGHT as $eight;

@@ -22,8 +22,15 @@ fn numbers(len: usize, seed: usize) -> Vec<f32> {
 /// Marks what no kernel may touch.
 const UNTOUCHED: f32 = 12345.0;
 
-/// Bound of the number of queries; Miri takes minutes for more.
-const QUERIES: usize = if cfg!(miri) { 5 } else { 35 };
+/// Cases of a property; Miri takes minutes for more.
+const CASES: u32 = if cfg!(miri) { 2 } else { 40 };
+/// Bound of the number of queries.
+const QUERIES: usize = miri(5, 35);
+
+/// A size under Miri, and without it.
+const fn miri(with: usize, without: usize) -> usize {
+    if cfg!(miri) { with } else { without }
+}
 
 /// Runs a step on an arena that starts with `input` and is `UNTOUCHED` behind it.
 fn run(
@@ -35,7 +42,28 @@ fn run(
     weights: &[f32],
 ) -> Vec<f32> {
     // Twice: what a kernel leaves behind must not matter to the next run.
-    let steps = vec![step.clone(), step.clone()];
+    run_steps(vec![step.clone(), step.clone()], k, threads, input, arena, weights)
+}
+
+/// As [`run`], for steps after one another without weights.
+fn run_all(
+    steps: Vec<Step>,
+    k: &'static Kernels,
+    threads: usize,
+    input: &[f32],
+    arena: usize,
+) -> Vec<f32> {
+    run_steps([steps.clone(), steps].concat(), k, threads, input, arena, &[0.0])
+}
+
+fn run_steps(
+    steps: Vec<Step>,
+    k: &'static Kernels,
+    threads: usize,
+    input: &[f32],
+    arena: usize,
+    weights: &[f32],
+) -> Vec<f32> {
     let program = Program::new(steps, arena, weights.len(), threads, k).unwrap();
     let mut team = Team::new(arena, weights.to_vec(), vec![program], k, threads, false).unwrap();
     let all = team.view_mut(0..arena);
@@ -78,12 +106,12 @@ fn for_all(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: if cfg!(miri) { 2 } else { 40 }, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: CASES, ..ProptestConfig::default() })]
 
     /// A convolution with a border, bias, residual and limits; 1 x 1 is a linear layer.
     #[test]
     fn products(
-        (h, w, c, n) in (1usize..8, 1usize..9, 1usize..20, 1usize..71),
+        (h, w, c, n) in (1usize..miri(4, 8), 1usize..miri(5, 9), 1usize..miri(6, 20), 1usize..miri(19, 71)),
         (kernel, stride, halo) in (prop::sample::select(vec![1usize, 3]), 1usize..3, 0usize..2),
         (gap, with, swish, threads) in (0usize..5, 0usize..4, any::<bool>(), 1usize..4),
     ) {
@@ -173,7 +201,7 @@ proptest! {
 
     #[test]
     fn depthwise_convolutions(
-        (h, w, c) in (1usize..7, 1usize..8, 1usize..40),
+        (h, w, c) in (1usize..miri(4, 7), 1usize..miri(4, 8), 1usize..miri(19, 40)),
         (kernel, stride, bias) in (prop::sample::select(vec![2usize, 3, 5]), 1usize..3, any::<bool>()),
         (swish, threads) in (any::<bool>(), 1usize..4),
     ) {
@@ -220,7 +248,7 @@ proptest! {
 
     #[test]
     fn pools(
-        (h, w, c) in (3usize..9, 3usize..9, 1usize..36),
+        (h, w, c) in (3usize..miri(5, 9), 3usize..miri(5, 9), 1usize..miri(19, 36)),
         (stride, pad, max, count_pad) in (1usize..3, 0usize..2, any::<bool>(), any::<bool>()),
         threads in 1usize..4,
     ) {
@@ -269,7 +297,7 @@ proptest! {
 
     #[test]
     fn normalisations(
-        (h, w, c, gap) in (1usize..5, 1usize..6, 1usize..75, 0usize..4),
+        (h, w, c, gap) in (1usize..miri(3, 5), 1usize..miri(4, 6), 1usize..miri(35, 75), 0usize..4),
         (map, centre, threads) in (any::<bool>(), any::<bool>(), 1usize..4),
     ) {
         let pitch = Pitch { y: w * (c + gap) + 1, x: c + gap };
@@ -342,7 +370,7 @@ proptest! {
     #[test]
     fn attention_of_any_size(
         (heads, queries, keys) in (1usize..4, 1usize..QUERIES, 1usize..2 * QUERIES),
-        (key, value, threads) in (1usize..37, 1usize..37, 1usize..4),
+        (key, value, threads) in (1usize..miri(12, 37), 1usize..miri(12, 37), 1usize..4),
     ) {
         let (qs, ks, vs) = (queries * heads * key, keys * heads * key, keys * heads * value);
         let input = numbers(qs + ks + vs, 1);
@@ -414,7 +442,7 @@ proptest! {
 
     #[test]
     fn products_of_computed_tensors(
-        (batch, m, n, depth) in (1usize..4, 1usize..5, 1usize..80, 1usize..80),
+        (batch, m, n, depth) in (1usize..miri(3, 4), 1usize..miri(3, 5), 1usize..miri(35, 80), 1usize..miri(35, 80)),
         (turned, threads) in (any::<bool>(), 1usize..3),
     ) {
         let (a_len, b_len) = (batch * m * depth, batch * depth * n);

@@ -3,7 +3,7 @@
 mod bytes;
 mod products;
 
-use super::super::graph::{Binary, Graph, GraphError, Node, Op, Reduce, Unary, Window};
+use super::super::graph::{Binary, Data, Graph, GraphError, Node, Op, Reduce, Unary, Window};
 use super::super::kernels::{
     Copy, Fold, Halo, LayerNorm, Map, MapNorm, Nest, Pitch, Place, Pool, Softmax, Step, Zip,
 };
@@ -32,7 +32,9 @@ pub fn lower(
             *need = window.halo().max(*need);
         }
     }
+    let narrow = graph.values.iter().any(|v| matches!(v.data, Some(Data::Scaled { .. })));
     let mut lower = Lower {
+        byte_attention: planner.byte_attention && narrow,
         planner,
         index,
         graph,
@@ -59,6 +61,8 @@ struct Lower<'p, 'g, 'a> {
     graph: &'g Graph<'a>,
     /// Of every value that is no constant, once it is known.
     views: Vec<Option<View>>,
+    /// Whether attention is computed in bytes, as the products around it are.
+    byte_attention: bool,
     /// Values that products take as bytes.
     bytes: Vec<Option<bytes::Bytes>>,
     /// Border that the convolutions after a value want.

@@ -131,6 +131,8 @@ pub struct Planner {
     mapping: Option<Arc<Mapping>>,
     made: HashMap<Made, usize>,
     lasting: usize,
+    /// Whether attention in graphs with products of bytes is computed in bytes too.
+    byte_attention: bool,
     /// Computed once, from constants only.
     once: (Vec<Step>, Vec<String>),
     /// Address and length of what that writes.
@@ -159,10 +161,16 @@ impl Planner {
             mapping,
             made: HashMap::new(),
             lasting: 0,
+            byte_attention: false,
             once: Default::default(),
             once_buffers: Vec::new(),
             routines: Vec::new(),
         }
+    }
+
+    /// Computes attention in bytes too, in graphs with products of bytes.
+    pub const fn narrow_attention(&mut self) {
+        self.byte_attention = true;
     }
 
     /// A buffer that lives on between runs; its address.

@@ -4,7 +4,7 @@ use super::Neon;
 use crate::engine::native::kernels::eight::{Dot, Layout};
 use core::arch::aarch64::*;
 
-/// Writes four whole numbers as bytes.
+/// Writes four numbers as bytes.
 #[inline(always)]
 unsafe fn narrow(v: float32x4_t, to: *mut u8) {
     // SAFETY: the caller promises room for four bytes.
@@ -62,6 +62,26 @@ impl Dot for DotProd {
         unsafe { vcvtq_f32_s32(sum) }
     }
     #[inline(always)]
+    unsafe fn all(n: i32) -> Self::I {
+        unsafe { vdupq_n_s32(n) }
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const i32) -> Self::I {
+        unsafe { vld1q_s32(p) }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut i32, sum: Self::I) {
+        unsafe { vst1q_s32(p, sum) }
+    }
+    #[inline(always)]
+    unsafe fn larger(a: Self::I, b: Self::I) -> Self::I {
+        unsafe { vmaxq_s32(a, b) }
+    }
+    #[inline(always)]
+    unsafe fn top(sum: Self::I) -> i32 {
+        unsafe { vmaxvq_s32(sum) }
+    }
+    #[inline(always)]
     unsafe fn narrow(v: float32x4_t, to: *mut u8) {
         unsafe { narrow(v, to) }
     }
@@ -109,6 +129,26 @@ impl Dot for Wide {
     #[inline(always)]
     unsafe fn floats(sum: Self::I) -> float32x4_t {
         unsafe { vcvtq_f32_s32(sum) }
+    }
+    #[inline(always)]
+    unsafe fn all(n: i32) -> Self::I {
+        unsafe { vdupq_n_s32(n) }
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const i32) -> Self::I {
+        unsafe { vld1q_s32(p) }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut i32, sum: Self::I) {
+        unsafe { vst1q_s32(p, sum) }
+    }
+    #[inline(always)]
+    unsafe fn larger(a: Self::I, b: Self::I) -> Self::I {
+        unsafe { vmaxq_s32(a, b) }
+    }
+    #[inline(always)]
+    unsafe fn top(sum: Self::I) -> i32 {
+        unsafe { vmaxvq_s32(sum) }
     }
     #[inline(always)]
     unsafe fn narrow(v: float32x4_t, to: *mut u8) {

@@ -35,11 +35,12 @@ fn packed(pixels: usize, channels: usize, pixel: usize, seed: usize) -> Vec<f32>
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: CASES, ..ProptestConfig::default() })]
 
     #[test]
     fn products_of_bytes(
-        (h, w, c, n) in (1usize..6, 1usize..9, 1usize..23, 1usize..71),
+        (h, w, c, n) in
+            (1usize..6, 1usize..miri(4, 9), 1usize..miri(7, 23), 1usize..miri(19, 71)),
         (kernel, stride) in (prop::sample::select(vec![1usize, 3]), 1usize..3),
         (gap, with, swish, threads) in (0usize..3, 0usize..4, any::<bool>(), 1usize..4),
     ) {
@@ -163,6 +164,128 @@ proptest! {
                         zero
                     };
                     prop_assert_eq!(b, want, "{} at {}, byte {}", name, i, k);
+                }
+            }
+        }
+    }
+
+    /// Attention in bytes against attention in numbers of twice the length. Rounding is what differs,
+    /// so the tolerance is that of steps; `flat` makes all weights nearly equal.
+    #[test]
+    fn attention_of_bytes(
+        (queries, keys) in (1usize..QUERIES, 1usize..miri(20, 70)),
+        (heads, key, value) in (1usize..miri(3, 4), 1usize..miri(12, 40), 1usize..miri(12, 40)),
+        (gap, threads, flat) in (0usize..5, 1usize..4, any::<bool>()),
+    ) {
+        let (row, out_row) = (heads * key.max(value) + gap, heads * value + gap);
+        let (most, far) = (queries.max(keys), keys.max(queries) * row);
+        let mut input = numbers(3 * most * row, 5);
+        // Keys and values far from zero: their mean must not cost precision.
+        input[far..].iter_mut().for_each(|x| *x += 6.0);
+        let (output, size) = (input.len() + 3, [keys, key, value]);
+        let scale = if flat { 1e-3 } else { 0.4 / (key as f32).sqrt() };
+        for (name, k) in all_tables() {
+            let panels = output + queries * out_row + 2;
+            let scratch = panels + heads * PackKvBytes::len(size, &k.eight);
+            let arena = scratch + threads * AttentionBytes::scratch_len(size, &k.eight);
+            let steps = vec![
+                Step::PackKvBytes(PackKvBytes {
+                    heads: (0..heads).map(|h| [h * key, h * value]).collect(),
+                    keys: Place::Arena(far),
+                    key_row: row,
+                    values: Place::Arena(2 * far),
+                    value_row: row,
+                    size,
+                    output: panels,
+                }),
+                Step::AttentionBytes(AttentionBytes {
+                    heads: (0..heads).map(|h| [h * key, h * value]).collect(),
+                    queries,
+                    size,
+                    input: Place::Arena(0),
+                    input_row: row,
+                    panels,
+                    output,
+                    output_row: out_row,
+                    scale,
+                    scratch,
+                }),
+            ];
+            let found = run_all(steps, k, threads, &input, arena);
+            let dot = |h: usize, i: usize, j: usize| -> f64 {
+                let at = |x: usize, d: usize| f64::from(input[x + h * key + d]);
+                (0..key).map(|d| at(i * row, d) * at(far + j * row, d)).sum()
+            };
+            for (h, i) in (0..heads).flat_map(|h| (0..queries).map(move |i| (h, i))) {
+                let logits: Vec<f64> =
+                    (0..keys).map(|j| dot(h, i, j) * f64::from(scale)).collect();
+                let top = logits.iter().copied().fold(f64::MIN, f64::max);
+                let weights: Vec<f64> = logits.iter().map(|x| (x - top).exp()).collect();
+                let sum: f64 = weights.iter().sum();
+                for e in 0..value {
+                    let v = |j: usize| f64::from(input[2 * far + j * row + h * value + e]);
+                    let want: f64 = (0..keys).map(|j| weights[j] / sum * v(j)).sum();
+                    let got = f64::from(found[output + i * out_row + h * value + e]);
+                    let room = if flat { 0.02 } else { 0.09 };
+                    prop_assert!(
+                        (got - want).abs() <= room,
+                        "{name}: {got}, not {want}: query {i}, head {h}, element {e}"
+                    );
+                }
+            }
+            for i in 0..queries {
+                let rest = &found[output + i * out_row + heads * value..output + (i + 1) * out_row];
+                prop_assert!(rest.iter().all(|&v| v == UNTOUCHED), "{name}: behind row {i}");
+            }
+            prop_assert_eq!(&found[panels - 2..panels], &[UNTOUCHED; 2][..]);
+            prop_assert_eq!(&found[input.len()..output], &[UNTOUCHED; 3][..]);
+        }
+    }
+}
+
+/// Every instruction set must come to the same bytes but where a number lies between two steps.
+#[test]
+fn instruction_sets_round_attention_alike() {
+    let (heads, queries, keys, size) = (2, miri(7, 29), miri(19, 53), miri(8, 24));
+    let row = 3 * heads * size;
+    let input = numbers(keys * row, 9);
+    let mut first: Option<Vec<f32>> = None;
+    for (name, k) in all_tables() {
+        let sizes = [keys, size, size];
+        let panels = input.len() + queries * heads * size;
+        let scratch = panels + heads * PackKvBytes::len(sizes, &k.eight);
+        let arena = scratch + AttentionBytes::scratch_len(sizes, &k.eight);
+        let starts = |first: usize| (0..heads).map(move |h| (first * heads + h) * size);
+        let steps = vec![
+            Step::PackKvBytes(PackKvBytes {
+                heads: starts(1).zip(starts(2)).map(|(k, v)| [k, v]).collect(),
+                keys: Place::Arena(0),
+                key_row: row,
+                values: Place::Arena(0),
+                value_row: row,
+                size: sizes,
+                output: panels,
+            }),
+            Step::AttentionBytes(AttentionBytes {
+                heads: (0..heads).map(|h| [h * size; 2]).collect(),
+                queries,
+                size: sizes,
+                input: Place::Arena(0),
+                input_row: row,
+                panels,
+                output: input.len(),
+                output_row: heads * size,
+                scale: 0.3,
+                scratch,
+            }),
+        ];
+        let found = run_all(steps, k, 1, &input, arena);
+        let found = found[input.len()..panels].to_vec();
+        match &first {
+            None => first = Some(found),
+            Some(first) => {
+                for (i, (a, b)) in first.iter().zip(&found).enumerate() {
+                    assert!((a - b).abs() <= 4e-3, "{name}: {b}, not {a} at {i}");
                 }
             }
         }

@@ -7,11 +7,11 @@ const ZIPPED: [Binary; 6] =
     [Binary::Add, Binary::Sub, Binary::Mul, Binary::Max, Binary::Min, Binary::MulHardSwish];
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: if cfg!(miri) { 2 } else { 40 }, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: CASES, ..ProptestConfig::default() })]
 
     #[test]
     fn element_by_element(
-        shape in (1usize..7, 1usize..7, 1usize..24).prop_map(|(a, b, c)| [a, b, c]),
+        shape in (1usize..miri(4, 7), 1usize..miri(4, 7), 1usize..miri(19, 24)).prop_map(|(a, b, c)| [a, b, c]),
         order in Just(vec![0usize, 1, 2]).prop_shuffle(),
         (op, broadcast, threads) in (0..ZIPPED.len(), 0usize..8, 1usize..4),
     ) {
@@ -53,7 +53,7 @@ proptest! {
     /// Runs, results side by side, and neither.
     #[test]
     fn reductions(
-        (planes, lines, columns) in (1usize..5, 1usize..40, 1usize..40),
+        (planes, lines, columns) in (1usize..miri(3, 5), 1usize..miri(12, 40), 1usize..miri(19, 40)),
         (kind, axes, threads) in (0usize..4, 1usize..7, 1usize..4),
     ) {
         let kind = [Reduce::Sum, Reduce::Mean, Reduce::Max, Reduce::Min][kind];
@@ -101,7 +101,7 @@ proptest! {
     /// Planes into pixels with a border, as before the first convolution, and back.
     #[test]
     fn copies_between_layouts(
-        (channels, h, w) in (1usize..5, 1usize..9, 1usize..70),
+        (channels, h, w) in (1usize..miri(3, 5), 1usize..miri(4, 9), 1usize..miri(35, 70)),
         (border, back, threads) in (0usize..2, any::<bool>(), 1usize..4),
     ) {
         let shape = [channels, h, w];

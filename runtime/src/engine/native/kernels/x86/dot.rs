@@ -38,12 +38,43 @@ impl Dot for Vnni512 {
         unsafe { _mm512_cvtepi32_ps(sum) }
     }
     #[inline(always)]
+    unsafe fn all(n: i32) -> Self::I {
+        unsafe { _mm512_set1_epi32(n) }
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const i32) -> Self::I {
+        unsafe { _mm512_loadu_si512(p.cast()) }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut i32, sum: Self::I) {
+        unsafe { _mm512_storeu_si512(p.cast(), sum) }
+    }
+    #[inline(always)]
+    unsafe fn larger(a: Self::I, b: Self::I) -> Self::I {
+        unsafe { _mm512_max_epi32(a, b) }
+    }
+    #[inline(always)]
+    unsafe fn top(sum: Self::I) -> i32 {
+        unsafe { _mm512_reduce_max_epi32(sum) }
+    }
+    #[inline(always)]
     unsafe fn narrow(v: __m512, to: *mut u8) {
         unsafe { _mm_storeu_si128(to.cast(), _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(v))) }
     }
 }
 
-/// Writes eight whole numbers as bytes; needs `avx2`.
+/// Largest of eight sums; needs `avx2`.
+#[inline(always)]
+unsafe fn top256(v: __m256i) -> i32 {
+    // SAFETY: the caller promises AVX2.
+    unsafe {
+        let four = _mm_max_epi32(_mm256_castsi256_si128(v), _mm256_extracti128_si256::<1>(v));
+        let two = _mm_max_epi32(four, _mm_shuffle_epi32::<0b01_00_11_10>(four));
+        _mm_cvtsi128_si32(_mm_max_epi32(two, _mm_shuffle_epi32::<0b10_11_00_01>(two)))
+    }
+}
+
+/// Writes eight numbers as bytes; needs `avx2`.
 #[inline(always)]
 unsafe fn narrow256(v: __m256, to: *mut u8) {
     // SAFETY: the caller promises AVX2 and room for eight bytes.
@@ -86,6 +117,26 @@ impl Dot for Vnni256 {
     #[inline(always)]
     unsafe fn floats(sum: Self::I) -> __m256 {
         unsafe { _mm256_cvtepi32_ps(sum) }
+    }
+    #[inline(always)]
+    unsafe fn all(n: i32) -> Self::I {
+        unsafe { _mm256_set1_epi32(n) }
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const i32) -> Self::I {
+        unsafe { _mm256_loadu_si256(p.cast()) }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut i32, sum: Self::I) {
+        unsafe { _mm256_storeu_si256(p.cast(), sum) }
+    }
+    #[inline(always)]
+    unsafe fn larger(a: Self::I, b: Self::I) -> Self::I {
+        unsafe { _mm256_max_epi32(a, b) }
+    }
+    #[inline(always)]
+    unsafe fn top(sum: Self::I) -> i32 {
+        unsafe { top256(sum) }
     }
     #[inline(always)]
     unsafe fn narrow(v: __m256, to: *mut u8) {
@@ -139,6 +190,26 @@ impl Dot for Wide256 {
     #[inline(always)]
     unsafe fn floats(sum: Self::I) -> __m256 {
         unsafe { _mm256_cvtepi32_ps(sum) }
+    }
+    #[inline(always)]
+    unsafe fn all(n: i32) -> Self::I {
+        unsafe { _mm256_set1_epi32(n) }
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const i32) -> Self::I {
+        unsafe { _mm256_loadu_si256(p.cast()) }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut i32, sum: Self::I) {
+        unsafe { _mm256_storeu_si256(p.cast(), sum) }
+    }
+    #[inline(always)]
+    unsafe fn larger(a: Self::I, b: Self::I) -> Self::I {
+        unsafe { _mm256_max_epi32(a, b) }
+    }
+    #[inline(always)]
+    unsafe fn top(sum: Self::I) -> i32 {
+        unsafe { top256(sum) }
     }
     #[inline(always)]
     unsafe fn narrow(v: __m256, to: *mut u8) {

@@ -2,7 +2,8 @@
 
 use super::super::super::graph::{Node, Post, Window};
 use super::super::super::kernels::{
-    Attention, Depthwise, Eight, Gemm, MatMul, PackKv, Pitch, Place, Step, ThinAttention,
+    Attention, AttentionBytes, Depthwise, Eight, Gemm, MatMul, PackKv, PackKvBytes, Pitch, Place,
+    Step, ThinAttention,
 };
 use super::super::rows::{offsets, rows};
 use super::super::view::{Base, View};
@@ -357,13 +358,11 @@ impl Lower<'_, '_, '_> {
         let outer = q.shape.len() - 2;
         let (queries, key) = (q.shape[outer], q.shape[outer + 1]);
         let (keys, value) = (v.shape[outer], v.shape[outer + 1]);
-        let shape = [&q.shape[..outer], &[queries, value]].concat();
-        // Heads side by side within each query, which is how they are used next.
-        let mut order: Vec<usize> = (0..outer + 2).collect();
-        if outer > 0 {
-            order.swap(outer - 1, outer);
+        if self.byte_attention && queries > THIN && key.max(keys) <= AttentionBytes::DEEPEST {
+            return self.attention_of_bytes([&q, &kt, &v], scale);
         }
-        let to = self.tensor(&shape, &order);
+        let shape = [&q.shape[..outer], &[queries, value]].concat();
+        let to = self.beside(&shape);
         let batch = q.shape[..outer].to_vec();
         let strides = [&q, &kt, &v, &to].map(|v| &v.stride[..outer]);
         let heads = offsets(&batch, strides);
@@ -406,6 +405,56 @@ impl Lower<'_, '_, '_> {
             output: panels,
         }));
         self.push(Step::Attention(Attention {
+            heads: heads.iter().map(|h| [h[0], h[3]]).collect(),
+            queries,
+            size,
+            input: self.place(q.base, q.offset)?,
+            input_row: q.stride[outer],
+            panels,
+            output: address(&to)?,
+            output_row: to.stride[outer],
+            scale,
+            scratch,
+        }));
+        Ok(to)
+    }
+
+    /// A new tensor with heads side by side within each query, which is how they are used next.
+    fn beside(&mut self, shape: &[usize]) -> View {
+        let outer = shape.len() - 2;
+        let mut order: Vec<usize> = (0..outer + 2).collect();
+        if outer > 0 {
+            order.swap(outer - 1, outer);
+        }
+        self.tensor(shape, &order)
+    }
+
+    /// Attention of queries, transposed keys and values, rounded to bytes on the way.
+    fn attention_of_bytes(&mut self, [q, kt, v]: [&View; 3], scale: f32) -> Try<View> {
+        let outer = q.shape.len() - 2;
+        let mut swapped: Vec<usize> = (0..outer + 2).collect();
+        swapped.swap(outer, outer + 1);
+        let (k, v) = (self.runs(&kt.transposed(&swapped))?, self.runs(v)?);
+        let (queries, size) =
+            (q.shape[outer], [v.shape[outer], q.shape[outer + 1], v.shape[outer + 1]]);
+        let shape = [&q.shape[..outer], &[queries, size[2]]].concat();
+        let to = self.beside(&shape);
+        let strides = [q, &k, &v, &to].map(|v| &v.stride[..outer]);
+        let heads = offsets(&q.shape[..outer], strides);
+        let eight = &self.planner.kernels.eight;
+        let scratch = self.planner.threads * AttentionBytes::scratch_len(size, eight);
+        let panels = heads.len() * PackKvBytes::len(size, eight);
+        let (scratch, panels) = (self.buffer(scratch), self.buffer(panels));
+        self.push(Step::PackKvBytes(PackKvBytes {
+            heads: heads.iter().map(|h| [h[1], h[2]]).collect(),
+            keys: self.place(k.base, k.offset)?,
+            key_row: k.stride[outer],
+            values: self.place(v.base, v.offset)?,
+            value_row: v.stride[outer],
+            size,
+            output: panels,
+        }));
+        self.push(Step::AttentionBytes(AttentionBytes {
             heads: heads.iter().map(|h| [h[0], h[3]]).collect(),
             queries,
             size,
