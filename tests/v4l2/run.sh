@@ -65,7 +65,7 @@ log=$(mktemp -d)
 trap 'rm -rf "$log"' EXIT
 rc=0
 within "${KERNEL_LIMIT:-1500}" "$here/vm.sh" $back --vivid --loopback=2 --uvc --prepare >"$log/prepare" 2>&1 || rc=$?
-[ $rc != 124 ] || skip "the kernel was not built within ${KERNEL_LIMIT:-1500} seconds: this machine is too busy"
+[ $rc != 124 ] || skip "the kernel was not built in time (KERNEL_LIMIT, TSDA_V4L2_LIMIT): this machine is too busy"
 [ $rc = 0 ] || skip "no kernel: $(tail -1 "$log/prepare")"
 echo "V4L2 tests: kernel there after $SECONDS s"
 
