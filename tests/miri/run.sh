@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Runs the unsafe code under Miri, which finds undefined behaviour that tests alone do not see: the
-# scalar kernels with arena and threads (all other instruction sets share their source), and the
-# pool of the allocator. Each property is tried on few cases, Miri is slow: about ten minutes.
+# scalar kernels with arena and threads (all other instruction sets share their source), the planner
+# that lays the arena out, and the pool of the allocator. Each property is tried on few and small cases
+# (`cfg(miri)`), Miri is slow: some minutes.
 #
 #   tests/miri/run.sh [--install] [FILTER..]
 #
@@ -17,11 +18,9 @@ if ! cargo +nightly miri --version >/dev/null 2>&1; then
     exit 77
 fi
 filters=("$@")
-[ $# -gt 0 ] || filters=(engine::native::kernels:: engine::native::sync:: system::pool::)
+[ $# -gt 0 ] || filters=(engine::native::kernels:: engine::native::plan:: engine::native::sync:: system::pool::)
 # Without isolation: the property tests read their seed and the clock. The nightly compiler of the
 # day may warn of what the pinned one does not.
 export MIRIFLAGS="${MIRIFLAGS:-} -Zmiri-disable-isolation" RUSTFLAGS="${RUSTFLAGS:-} --cap-lints=warn"
-for filter in "${filters[@]}"; do
-    echo "== miri: $filter"
-    cargo +nightly miri test --locked -p tsda-runtime --features native,pool --lib "$filter"
-done
+echo "== miri: ${filters[*]}"
+cargo +nightly miri test --locked -p tsda-runtime --features native,pool --lib -- "${filters[@]}"

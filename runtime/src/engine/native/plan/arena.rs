@@ -59,6 +59,9 @@ mod tests {
     }
 
     proptest! {
+        // Miri takes minutes for more.
+        #![proptest_config(ProptestConfig { cases: if cfg!(miri) { 4 } else { 256 }, ..ProptestConfig::default() })]
+
         #[test]
         fn buffers_in_use_together_are_apart(
             lives in prop::collection::vec((1usize..500, 0usize..20, 0usize..6), 0..40),

@@ -318,7 +318,7 @@ unsafe fn pack_values<D: Dot>(s: &PackKvBytes, values: *const f32, out: *mut f32
                         *row = rounded::<D>(values.add(j * s.value_row + at), n, mean, factor);
                     }
                 }
-                let rows = rows.map(|row| bytes_of(row));
+                let rows = rows.map(bytes_of);
                 let mut words = [0u32; MAX_BYTES];
                 for (lane, word) in words.iter_mut().enumerate() {
                     *word = u32::from_ne_bytes([
