@@ -27,7 +27,7 @@ use tsda_runtime::EngineError;
 use tsda_runtime::bundle::{
     Bundle, BundleError, Loss, Manifest, Numbers, Precision, SectionKind, crc32,
 };
-use tsda_runtime::engine::NativeEngine;
+use tsda_runtime::engine::{NativeEngine, NativeOptions};
 use tsda_runtime::probe::{self, Probe, ProbeError};
 
 /// A bundle that cannot be made narrower.
@@ -309,7 +309,9 @@ pub fn quantize_on(
     let before = bundle.require(SectionKind::Probe)?;
     sections.push((SectionKind::Probe, before.to_vec()));
     let draft = bundle::encode(&narrow, &sections)?;
-    let mut engine = NativeEngine::from_bundle(&Bundle::parse(&draft)?)?;
+    // As the file says it: attention in bytes is this engine's own.
+    let plain = NativeOptions { float_attention: true, ..NativeOptions::default() };
+    let mut engine = NativeEngine::with_options(&Bundle::parse(&draft)?, plain)?;
     let far = probe::run(&mut engine, &Probe::parse(before, &manifest.spec)?)?;
     let most = |of: fn(&probe::ProbeDiff) -> f32| far.diffs.iter().map(of).fold(0.0, f32::max);
     let probe = [most(|d| d.scores), most(|d| d.ltrb)];
