@@ -17,8 +17,9 @@ fn tsda(dir: &Path, args: &[&str]) -> String {
     text
 }
 
-/// A thermal sequence: the drawn clip for 10 frames, then an empty picture for 40, then 15 with the
-/// target alone, at the other end of the picture. Nothing else in it could be taken for the target.
+/// A thermal sequence: the drawn clip for 10 frames, then the street without people for 40, then 15
+/// with the target standing at the other end of the picture. The others on the street, who could be taken for
+/// the target, are covered by what lies left of them throughout.
 fn vanishing(dir: &Path) {
     use tsda_host::picture::Picture;
     let clip = tsda_host::render::Clip::new(tsda_host::render::ClipConfig::default());
@@ -26,19 +27,24 @@ fn vanishing(dir: &Path) {
     std::fs::create_dir_all(&folder).expect("mkdir");
     let (mut source, mut boxes) = (Picture::default(), String::new());
     for i in 0..65 {
-        let seen = if i < 50 { i.min(10) } else { i - 50 };
-        clip.render(seen, tsda_runtime::Modality::Thermal, &mut source);
-        let b = clip.truth(seen);
+        clip.render(i.min(10), tsda_runtime::Modality::Thermal, &mut source);
+        let b = clip.truth(i.min(10));
         let mut shown = source.clone();
-        let (mut x, shift) = (b.x, (200.0 - b.x) as usize);
-        if i >= 10 {
-            shown.data.fill(90);
+        let mut x = b.x;
+        let (left, right) = (b.x as usize - 8, (b.x + b.w) as usize + 8);
+        let width = source.width;
+        for (from, to) in source.data.chunks_exact(width).zip(shown.data.chunks_exact_mut(width)) {
+            to[230..].copy_from_slice(&from[120..120 + width - 230]);
+            if i >= 10 {
+                to[left..right].copy_from_slice(&from[right..2 * right - left]);
+            }
         }
         if i >= 50 {
+            let shift = 250 - left;
             x += shift as f32;
             for row in (b.y as usize - 5)..(b.y + b.h) as usize + 5 {
-                let at = row * source.width + b.x as usize - 5;
-                let patch = &source.data[at..at + b.w as usize + 10];
+                let at = row * width + left;
+                let patch = &source.data[at..at + right - left];
                 shown.data[at + shift..][..patch.len()].copy_from_slice(patch);
             }
         }
@@ -57,6 +63,7 @@ fn vanishing(dir: &Path) {
 fn the_scan_finds_a_target_that_comes_out_elsewhere() {
     let dir = tempfile::tempdir().expect("temp");
     vanishing(dir.path());
+
     let figures = |more: &[&str]| {
         let base =
             ["presence", "--dataset", "sequences:set", "--protocol", "t", "--json", "p.json"];
