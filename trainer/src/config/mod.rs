@@ -210,6 +210,10 @@ pub struct ProcessingConfig {
     /// Chance that the sample's RGB pictures turn into one random mixture of their channels instead,
     /// which comes nearer to what a thermal camera shows of a coloured thing.
     pub channel_mix_p: f64,
+    /// Chance that, in a sample within one sensor, either the templates or the search crop are shown as
+    /// another sensor might: one random mixture of the channels, then an arbitrary curve over the grey
+    /// values. Not in the paper; for material with few pictures of two sensors.
+    pub sensor_shift_p: f64,
     /// Largest share of the target's width and height that an occluder covers
     /// (`sampler.occluder_p`).
     pub occluder_side: f32,
@@ -233,6 +237,7 @@ impl Default for ProcessingConfig {
             crop_flip_p: 0.5,
             grayscale_p: 0.05,
             channel_mix_p: 0.0,
+            sensor_shift_p: 0.0,
             occluder_side: 0.6,
             brightness: 0.2,
             rgb: PhotometricConfig::default(),

@@ -169,6 +169,7 @@ fn check_processing(p: &ProcessingConfig) -> Result<(), FieldError> {
     share("processing.crop_flip_p", p.crop_flip_p)?;
     share("processing.grayscale_p", p.grayscale_p)?;
     share("processing.channel_mix_p", p.channel_mix_p)?;
+    share("processing.sensor_shift_p", p.sensor_shift_p)?;
     within("processing.occluder_side", p.occluder_side.into(), 0.1, 0.9)?;
     within("processing.brightness", p.brightness.into(), 0.0, 0.9)?;
     check_photometric("rgb", &p.rgb)?;

@@ -14,6 +14,44 @@ pub(super) fn channel_mix(rng: &mut impl Rng) -> [f32; 3] {
     weights.map(|weight| weight / sum)
 }
 
+/// How another sensor might show what this one shows: the channels' mixture, then an arbitrary curve
+/// over the grey values. Edges mostly stay; which side of them is bright does not.
+#[derive(Clone, Debug)]
+pub(super) struct SensorShift {
+    weights: [f32; 3],
+    table: [u8; 256],
+}
+
+impl SensorShift {
+    /// Grey values that five random knots span at least.
+    const SPAN: f32 = 96.0;
+
+    /// A random one: the curve runs straight between five knots.
+    pub fn draw(rng: &mut impl Rng) -> Self {
+        let weights = channel_mix(rng);
+        let knots = loop {
+            let knots: [f32; 5] = std::array::from_fn(|_| 255.0 * rng.random::<f32>());
+            let (low, high) =
+                knots.iter().fold((255.0f32, 0.0f32), |(l, h), v| (l.min(*v), h.max(*v)));
+            if high - low >= Self::SPAN {
+                break knots;
+            }
+        };
+        let table = std::array::from_fn(|v| {
+            let (knot, share) = (v / 64, (v % 64) as f32 / 64.0);
+            (knots[knot] + (knots[knot + 1] - knots[knot]) * share).round_ties_even() as u8
+        });
+        Self { weights, table }
+    }
+
+    /// The crop as that sensor shows it: one channel.
+    pub fn apply(&self, pixels: Pixels) -> Pixels {
+        let mut grey = pixels.into_grey(self.weights);
+        grey.data.iter_mut().for_each(|v| *v = self.table[usize::from(*v)]);
+        grey
+    }
+}
+
 /// Pixels of a square crop: 8-bit, interleaved, 1 or 3 channels.
 pub(super) struct Pixels {
     pub side: usize,
@@ -288,6 +326,28 @@ mod tests {
         assert!((a.iter().sum::<f32>() - 1.0).abs() < 1e-6 && a != b);
         let p = Pixels { side: 1, channels: 3, data: vec![200, 200, 200] }.into_grey(a);
         assert_eq!((p.channels, p.data), (1, vec![200]));
+    }
+
+    #[test]
+    fn sensor_shifts_keep_structure_but_not_polarity() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let (mut rising, mut falling) = (0, 0);
+        for _ in 0..50 {
+            let shift = SensorShift::draw(&mut rng);
+            let shown = shift.apply(ramp(16, 3));
+            assert_eq!((shown.channels, shown.data.len()), (1, 256));
+            let (low, high) =
+                (shift.table.iter().min().unwrap(), shift.table.iter().max().unwrap());
+            // The last knot lies one beyond the table.
+            assert!(high - low >= 90, "{low} {high}");
+            let steps = shift.table.windows(2).map(|w| w[0].abs_diff(w[1])).max().unwrap();
+            assert!(steps <= 4, "a jump of {steps} where the scene has none");
+            match shift.table[0] < shift.table[255] {
+                true => rising += 1,
+                false => falling += 1,
+            }
+        }
+        assert!(rising > 10 && falling > 10, "{rising} {falling}");
     }
 
     #[test]

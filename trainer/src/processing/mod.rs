@@ -1,7 +1,7 @@
 //! From drawn frames to network input (spec 2.2 to 2.4).
 //!
 //! Order, for one sample: one draw for all frames (grey or channel mixture, whole-picture mirror,
-//! polarity); then for every crop on its own: jitter, cut, (search crop) target covered, distractor
+//! polarity, a shift of the sensor between templates and search); then for every crop on its own: jitter, cut, (search crop) target covered, distractor
 //! and occluder, window, tone curve, smear, blur and noise, brightness, mirror, normalisation. Labels
 //! are made from the box in crop pixels.
 //!
@@ -20,7 +20,7 @@ pub use sheet::contact_sheet;
 
 use crate::config::{JitterConfig, PhotometricConfig, ProcessingConfig};
 use crate::sampler::{Absence, Drawn, DrawnFrame};
-use augment::Pixels;
+use augment::{Pixels, SensorShift};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -97,12 +97,15 @@ fn flip_box(bbox: &BBox, width: usize) -> BBox {
 }
 
 /// What one draw decides for the whole sample.
+#[derive(Clone)]
 struct Joint {
     /// Weights of R, G, B where RGB pictures turn into one channel.
     grey: Option<[f32; 3]>,
     mirror: bool,
     invert_rgb: bool,
     invert_thermal: bool,
+    /// Shows these crops as another sensor might.
+    shift: Option<SensorShift>,
 }
 
 /// What is pasted into a search crop.
@@ -142,15 +145,22 @@ impl Processor {
             mirror: chance(config.joint_flip_p),
             invert_rgb: chance(config.rgb.invert_p),
             invert_thermal: chance(config.thermal.invert_p),
+            shift: None,
         };
         if self.augment && config.channel_mix_p > 0.0 && rng.random_bool(config.channel_mix_p) {
             joint.grey = Some(augment::channel_mix(rng));
+        }
+        let (mut for_templates, mut for_search) = (joint.clone(), joint);
+        let one_sensor = !drawn.is_cross() && self.augment && config.sensor_shift_p > 0.0;
+        if one_sensor && rng.random_bool(config.sensor_shift_p) {
+            let side = if rng.random() { &mut for_templates } else { &mut for_search };
+            side.shift = Some(SensorShift::draw(rng));
         }
         let nothing = Others { distractor: None, occluder: None, covered: false };
         let templates = drawn
             .templates
             .iter()
-            .map(|f| self.crop(f, &config.template, &joint, &nothing, rng).0)
+            .map(|f| self.crop(f, &config.template, &for_templates, &nothing, rng).0)
             .collect();
         let absence = drawn.absence.as_ref().filter(|_| self.augment);
         let others = Others {
@@ -163,7 +173,7 @@ impl Processor {
             Some(Absence::Another(frame)) => (frame, true),
             _ => (&drawn.search, false),
         };
-        let (search, covered) = self.crop(frame, &config.search, &joint, &others, rng);
+        let (search, covered) = self.crop(frame, &config.search, &for_search, &others, rng);
         let present = !elsewhere && !covered;
         Sample { id: drawn.id.clone(), templates, search, cross: drawn.is_cross(), present }
     }
@@ -204,6 +214,9 @@ impl Processor {
         }
         if let Some(weights) = joint.grey {
             pixels = pixels.into_grey(weights);
+        }
+        if let Some(shift) = &joint.shift {
+            pixels = shift.apply(pixels);
         }
         let mut mirror = false;
         let planes = if self.augment {

@@ -182,6 +182,36 @@ fn polarity_is_turned_for_all_thermal_crops_of_a_sample_at_once() {
 }
 
 #[test]
+fn one_sensor_is_shown_as_two_and_two_sensors_stay_as_they_are() {
+    let still = JitterConfig { scale: 0.0, centre: 0.0, aspect: 0.0 };
+    let plain = ProcessingConfig {
+        template: still,
+        search: still,
+        brightness: 0.0,
+        grayscale_p: 0.0,
+        joint_flip_p: 0.0,
+        crop_flip_p: 0.0,
+        ..Default::default()
+    };
+    let shifted = ProcessingConfig { sensor_shift_p: 1.0, ..plain.clone() };
+    let (a, b) = (maker(&plain, 3, true), maker(&shifted, 3, true));
+    let (mut templates, mut searches, mut cross) = (0, 0, 0);
+    for i in 0..40 {
+        let (a, b) = (a.sample(i).unwrap(), b.sample(i).unwrap());
+        let same = |x: &Crop, y: &Crop| x.pixels == y.pixels;
+        let search = same(&a.search, &b.search);
+        let template = a.templates.iter().zip(&b.templates).all(|(x, y)| same(x, y));
+        match (a.cross, template, search) {
+            (true, true, true) => cross += 1,
+            (false, false, true) => templates += 1,
+            (false, true, false) => searches += 1,
+            other => panic!("sample {i}: {other:?}"),
+        }
+    }
+    assert!(cross > 5 && templates > 3 && searches > 3, "{cross} {templates} {searches}");
+}
+
+#[test]
 fn the_sheet_holds_every_crop() {
     let maker = maker(&ProcessingConfig::default(), 1, true);
     let samples: Vec<Sample> = (0..3).map(|i| maker.sample(i).unwrap()).collect();
