@@ -147,10 +147,10 @@ fn without_jitter_the_target_sits_in_the_middle() {
     }
 }
 
-#[test]
-fn polarity_is_turned_for_all_thermal_crops_of_a_sample_at_once() {
+/// Crops as they are, in the middle.
+fn unchanged() -> ProcessingConfig {
     let still = JitterConfig { scale: 0.0, centre: 0.0, aspect: 0.0 };
-    let plain = ProcessingConfig {
+    ProcessingConfig {
         template: still,
         search: still,
         brightness: 0.0,
@@ -158,7 +158,12 @@ fn polarity_is_turned_for_all_thermal_crops_of_a_sample_at_once() {
         joint_flip_p: 0.0,
         crop_flip_p: 0.0,
         ..Default::default()
-    };
+    }
+}
+
+#[test]
+fn polarity_is_turned_for_all_thermal_crops_of_a_sample_at_once() {
+    let plain = unchanged();
     let mut turned = plain.clone();
     turned.thermal.invert_p = 1.0;
     let (a, b) = (maker(&plain, 3, true), maker(&turned, 3, true));
@@ -183,16 +188,7 @@ fn polarity_is_turned_for_all_thermal_crops_of_a_sample_at_once() {
 
 #[test]
 fn one_sensor_is_shown_as_two_and_two_sensors_stay_as_they_are() {
-    let still = JitterConfig { scale: 0.0, centre: 0.0, aspect: 0.0 };
-    let plain = ProcessingConfig {
-        template: still,
-        search: still,
-        brightness: 0.0,
-        grayscale_p: 0.0,
-        joint_flip_p: 0.0,
-        crop_flip_p: 0.0,
-        ..Default::default()
-    };
+    let plain = unchanged();
     let shifted = ProcessingConfig { sensor_shift_p: 1.0, ..plain.clone() };
     let (a, b) = (maker(&plain, 3, true), maker(&shifted, 3, true));
     let (mut templates, mut searches, mut cross) = (0, 0, 0);

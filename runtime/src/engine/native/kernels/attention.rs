@@ -87,7 +87,7 @@ impl PackKv {
     }
 }
 
-/// Attention over packed keys and values.
+/// Attention over packed keys and values, in floats or ([`super::PackKvBytes`]) bytes.
 #[derive(Clone, Debug)]
 pub struct Attention {
     /// Where the queries and results of each head start, from the places below.
@@ -100,7 +100,7 @@ pub struct Attention {
     pub input: Place,
     /// From query to query.
     pub input_row: usize,
-    /// What [`PackKv`] made.
+    /// What [`PackKv`] or its twin of bytes made.
     pub panels: usize,
     /// Results; each one a run.
     pub output: usize,
@@ -108,7 +108,7 @@ pub struct Attention {
     pub output_row: usize,
     /// Factor of the logits, positive.
     pub scale: f32,
-    /// Rows of weights that are being worked on, [`Self::scratch_len`] per thread.
+    /// Rows of weights that are being worked on, [`Self::scratch_len`] (or the twin's) per thread.
     pub scratch: usize,
 }
 

@@ -4,12 +4,13 @@
 
 mod attention;
 
+use super::attention::Attention;
 use super::gemm::{Packing, Tile, TileFn};
 use super::simd::{Simd, hard_swish};
 use super::table::{MAX_ROWS, MAX_VECTORS};
 use super::{Halo, Mem, Part, Pitch, Place};
 
-pub use attention::{AttentionBytes, PackKvBytes, attend, pack as pack_kv};
+pub use attention::{PackKvBytes, attend, pack as pack_kv};
 
 /// Bytes in the place of a float.
 pub const BYTES: usize = 4;
@@ -50,7 +51,7 @@ pub struct Eight {
     pub(super) tiles: [[TileFn; MAX_ROWS]; MAX_VECTORS],
     pub(super) quantise: unsafe fn(&Quantise, Mem, Part),
     pub(super) pack_kv: unsafe fn(&PackKvBytes, Mem, Part),
-    pub(super) attend: unsafe fn(&AttentionBytes, Mem, Part),
+    pub(super) attend: unsafe fn(&Attention, Mem, Part),
 }
 
 impl Eight {

@@ -34,7 +34,7 @@ mod x86;
 
 pub use attention::{Attention, PackKv, ThinAttention};
 pub use conv::{Depthwise, Pool};
-pub use eight::{AttentionBytes, Eight, PackKvBytes, Quantise};
+pub use eight::{Eight, PackKvBytes, Quantise};
 pub use gemm::Gemm;
 pub use loops::{Copy, Fold, Map, Nest, Zip};
 pub use matmul::MatMul;

@@ -3,9 +3,8 @@
 use super::attention::Attention;
 use super::eight::BYTES;
 use super::{
-    AttentionBytes, Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm,
-    MatMul, Mem, PackKv, PackKvBytes, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention,
-    Zip,
+    Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem,
+    PackKv, PackKvBytes, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
 };
 use crate::engine::native::sync::Barrier;
 use std::time::{Duration, Instant};
@@ -49,7 +48,7 @@ pub enum Step {
     /// Keys and values into panels of bytes.
     PackKvBytes(PackKvBytes),
     /// Attention over panels of bytes.
-    AttentionBytes(AttentionBytes),
+    AttentionBytes(Attention),
     /// Attention of few queries.
     ThinAttention(ThinAttention),
 }
@@ -173,13 +172,10 @@ impl Step {
             Self::LayerNorm(s) => 8 * s.size[0] * s.size[1] * s.columns,
             Self::MapNorm(s) => 8 * s.size[0] * s.size[1] * s.channels,
             Self::PackKv(s) => 4 * s.heads.len() * s.size[0] * (s.size[1] + s.size[2]),
-            Self::Attention(s) => {
+            Self::Attention(s) | Self::AttentionBytes(s) => {
                 s.heads.len() * s.queries * s.size[0] * (2 * (s.size[1] + s.size[2]) + 16)
             }
             Self::PackKvBytes(s) => 8 * s.heads.len() * s.size[0] * (s.size[1] + s.size[2]),
-            Self::AttentionBytes(s) => {
-                s.heads.len() * s.queries * s.size[0] * (2 * (s.size[1] + s.size[2]) + 16)
-            }
             Self::ThinAttention(s) => {
                 s.heads.len() * s.queries * s.size[0] * (2 * (s.size[1] + s.size[2]) + 16)
             }
@@ -274,7 +270,7 @@ impl Step {
                 place(&mut s.values);
                 at(&mut s.output);
             }
-            Self::Attention(s) => {
+            Self::Attention(s) | Self::AttentionBytes(s) => {
                 place(&mut s.input);
                 at(&mut s.panels);
                 at(&mut s.output);
@@ -284,12 +280,6 @@ impl Step {
                 place(&mut s.keys);
                 place(&mut s.values);
                 at(&mut s.output);
-            }
-            Self::AttentionBytes(s) => {
-                place(&mut s.input);
-                at(&mut s.panels);
-                at(&mut s.output);
-                at(&mut s.scratch);
             }
             Self::ThinAttention(s) => {
                 s.inputs.iter_mut().for_each(place);
@@ -391,40 +381,34 @@ impl Step {
                 spans.read(s.values, farthest(&s.heads, 1) + run(count, s.value_stride, value));
                 spans.write(s.output, s.heads.len() * PackKv::len(s.size, k).1);
             }
-            Self::Attention(s) => {
+            Self::Attention(s) | Self::AttentionBytes(s) => {
                 let [keys, key, value] = s.size;
+                let of_bytes = matches!(self, Self::AttentionBytes(_));
+                let (panels, scratch) = match of_bytes {
+                    true => (
+                        PackKvBytes::len(s.size, &k.eight),
+                        PackKvBytes::scratch_len(s.size, &k.eight),
+                    ),
+                    false => (PackKv::len(s.size, k).1, Attention::scratch_len(keys)),
+                };
                 let queries = (s.queries - 1) * s.input_row + key;
                 spans.read(s.input, farthest(&s.heads, 0) + queries);
-                let panels = s.heads.len() * PackKv::len(s.size, k).1;
-                spans.read(Place::Arena(s.panels), panels);
+                spans.read(Place::Arena(s.panels), s.heads.len() * panels);
                 let results = (s.queries - 1) * s.output_row + value;
                 spans.write(s.output, farthest(&s.heads, 1) + results);
-                spans.write(s.scratch, threads * Attention::scratch_len(keys));
+                spans.write(s.scratch, threads * scratch);
                 let starts = s.heads.iter().map(|h| h[1]);
                 let apart = blocks(starts, s.queries, s.output_row, value);
                 spans.demand(apart, "its results overlap");
+                // Sums of products of bytes must stay away from the ends of their range.
+                let deep = !of_bytes || key.max(keys) <= PackKvBytes::DEEPEST;
+                spans.demand(deep, "its sums could overflow");
             }
             Self::PackKvBytes(s) => {
                 let [count, key, value] = s.size;
                 spans.read(s.keys, farthest(&s.heads, 0) + (count - 1) * s.key_row + key);
                 spans.read(s.values, farthest(&s.heads, 1) + (count - 1) * s.value_row + value);
                 spans.write(s.output, s.heads.len() * PackKvBytes::len(s.size, &k.eight));
-            }
-            Self::AttentionBytes(s) => {
-                let [_, key, value] = s.size;
-                let queries = (s.queries - 1) * s.input_row + key;
-                spans.read(s.input, farthest(&s.heads, 0) + queries);
-                let panels = s.heads.len() * PackKvBytes::len(s.size, &k.eight);
-                spans.read(Place::Arena(s.panels), panels);
-                let results = (s.queries - 1) * s.output_row + value;
-                spans.write(s.output, farthest(&s.heads, 1) + results);
-                spans.write(s.scratch, threads * AttentionBytes::scratch_len(s.size, &k.eight));
-                let starts = s.heads.iter().map(|h| h[1]);
-                let apart = blocks(starts, s.queries, s.output_row, value);
-                spans.demand(apart, "its results overlap");
-                // Sums of products of bytes must stay away from the ends of their range.
-                let deep = key.max(s.size[0]) <= AttentionBytes::DEEPEST;
-                spans.demand(deep, "its sums could overflow");
             }
             Self::ThinAttention(s) => {
                 let [keys, key, value] = s.size;

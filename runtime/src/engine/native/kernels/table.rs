@@ -2,7 +2,7 @@
 
 use super::attention::{self, Attention, ThinAttention};
 use super::conv::{self, Depthwise, Pool};
-use super::eight::{self, AttentionBytes, Dot, Eight, PackKvBytes, Quantise, ScalarDot};
+use super::eight::{self, Dot, Eight, PackKvBytes, Quantise, ScalarDot};
 use super::gemm::{self, Packing, Tile, TileFn};
 use super::loops::{self, Copy, Fold, Map, Zip};
 use super::matmul::{self, MatMul};
@@ -200,7 +200,7 @@ macro_rules! table {
                 => eight::quantise::<$dot>(s, m, p));
             table!(@one $feature pack_kv[](s: &PackKvBytes, m: Mem, p: Part)
                 => eight::pack_kv::<$dot>(s, m, p));
-            table!(@one $feature attend[](s: &AttentionBytes, m: Mem, p: Part)
+            table!(@one $feature attend[](s: &Attention, m: Mem, p: Part)
                 => eight::attend::<$dot, $rows>(s, m, p));
 
             const fn tiles<const NV: usize>() -> [TileFn; MAX_ROWS] {

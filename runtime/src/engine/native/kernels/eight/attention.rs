@@ -9,6 +9,7 @@
 //! the mean stands in for values whose weights were too small to be seen.
 
 use super::{BYTES, Dot, Eight, Layout};
+use crate::engine::native::kernels::attention::Attention;
 use crate::engine::native::kernels::gemm::Packing;
 use crate::engine::native::kernels::simd::Simd;
 use crate::engine::native::kernels::table::MAX_VECTORS;
@@ -93,34 +94,7 @@ impl PackKvBytes {
     pub const fn len(size: [usize; 3], eight: &Eight) -> usize {
         Panels::new(size, eight.packing).len
     }
-}
 
-/// Attention over packed bytes.
-#[derive(Clone, Debug)]
-pub struct AttentionBytes {
-    /// Where the queries and results of each head start, from the places below.
-    pub heads: Box<[[usize; 2]]>,
-    /// Number of queries.
-    pub queries: usize,
-    /// Number of keys, length of a key, length of a value.
-    pub size: [usize; 3],
-    /// Queries; each one a run.
-    pub input: Place,
-    /// From query to query.
-    pub input_row: usize,
-    /// What [`PackKvBytes`] made.
-    pub panels: usize,
-    /// Results; each one a run.
-    pub output: usize,
-    /// From result to result.
-    pub output_row: usize,
-    /// Factor of the logits, positive.
-    pub scale: f32,
-    /// Rows that are being worked on, [`Self::scratch_len`] per thread.
-    pub scratch: usize,
-}
-
-impl AttentionBytes {
     /// Most keys, and longest key: sums of this many products keep away from the ends of 32 bits.
     pub const DEEPEST: usize = 1 << 14;
 
@@ -129,7 +103,7 @@ impl AttentionBytes {
         [(panels.keys / BYTES).next_multiple_of(packing.lanes), panels.keys + packing.lanes]
     }
 
-    /// Scratch of one thread.
+    /// Scratch of one thread for the attention over them.
     pub const fn scratch_len(size: [usize; 3], eight: &Eight) -> usize {
         let panels = Panels::new(size, eight.packing);
         let [weights, sums] = Self::rows(&panels, eight.packing);
@@ -376,10 +350,10 @@ unsafe fn put<D: Dot>(p: *mut f32, lane: usize, four: u32) {
 /// The step was checked against the memory and the number of threads, the instruction set is there,
 /// nobody else touches the result.
 #[inline(always)]
-pub unsafe fn attend<D: Dot, const R: usize>(s: &AttentionBytes, mem: Mem, part: Part) {
+pub unsafe fn attend<D: Dot, const R: usize>(s: &Attention, mem: Mem, part: Part) {
     let (lanes, [_, key, value]) = (D::F::LANES, s.size);
     let p = Panels::new(s.size, packing::<D>());
-    let [weights_row, sums_row] = AttentionBytes::rows(&p, packing::<D>());
+    let [weights_row, sums_row] = PackKvBytes::rows(&p, packing::<D>());
     let queries_row = p.groups.next_multiple_of(lanes);
     let tiles = s.queries.div_ceil(R);
     let width = MAX_VECTORS * lanes;

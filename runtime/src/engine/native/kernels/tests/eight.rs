@@ -187,7 +187,7 @@ proptest! {
         for (name, k) in all_tables() {
             let panels = output + queries * out_row + 2;
             let scratch = panels + heads * PackKvBytes::len(size, &k.eight);
-            let arena = scratch + threads * AttentionBytes::scratch_len(size, &k.eight);
+            let arena = scratch + threads * PackKvBytes::scratch_len(size, &k.eight);
             let steps = vec![
                 Step::PackKvBytes(PackKvBytes {
                     heads: (0..heads).map(|h| [h * key, h * value]).collect(),
@@ -198,7 +198,7 @@ proptest! {
                     size,
                     output: panels,
                 }),
-                Step::AttentionBytes(AttentionBytes {
+                Step::AttentionBytes(Attention {
                     heads: (0..heads).map(|h| [h * key, h * value]).collect(),
                     queries,
                     size,
@@ -254,7 +254,7 @@ fn instruction_sets_round_attention_alike() {
         let sizes = [keys, size, size];
         let panels = input.len() + queries * heads * size;
         let scratch = panels + heads * PackKvBytes::len(sizes, &k.eight);
-        let arena = scratch + AttentionBytes::scratch_len(sizes, &k.eight);
+        let arena = scratch + PackKvBytes::scratch_len(sizes, &k.eight);
         let starts = |first: usize| (0..heads).map(move |h| (first * heads + h) * size);
         let steps = vec![
             Step::PackKvBytes(PackKvBytes {
@@ -266,7 +266,7 @@ fn instruction_sets_round_attention_alike() {
                 size: sizes,
                 output: panels,
             }),
-            Step::AttentionBytes(AttentionBytes {
+            Step::AttentionBytes(Attention {
                 heads: (0..heads).map(|h| [h * size; 2]).collect(),
                 queries,
                 size: sizes,

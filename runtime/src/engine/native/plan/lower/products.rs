@@ -2,8 +2,8 @@
 
 use super::super::super::graph::{Node, Post, Window};
 use super::super::super::kernels::{
-    Attention, AttentionBytes, Depthwise, Eight, Gemm, MatMul, PackKv, PackKvBytes, Pitch, Place,
-    Step, ThinAttention,
+    Attention, Depthwise, Eight, Gemm, MatMul, PackKv, PackKvBytes, Pitch, Place, Step,
+    ThinAttention,
 };
 use super::super::rows::{offsets, rows};
 use super::super::view::{Base, View};
@@ -358,7 +358,7 @@ impl Lower<'_, '_, '_> {
         let outer = q.shape.len() - 2;
         let (queries, key) = (q.shape[outer], q.shape[outer + 1]);
         let (keys, value) = (v.shape[outer], v.shape[outer + 1]);
-        if self.byte_attention && queries > THIN && key.max(keys) <= AttentionBytes::DEEPEST {
+        if self.byte_attention && queries > THIN && key.max(keys) <= PackKvBytes::DEEPEST {
             return self.attention_of_bytes([&q, &kt, &v], scale);
         }
         let shape = [&q.shape[..outer], &[queries, value]].concat();
@@ -404,19 +404,33 @@ impl Lower<'_, '_, '_> {
             size,
             output: panels,
         }));
-        self.push(Step::Attention(Attention {
+        let step = self.attend([&q, &to], &heads, size, scale, [panels, scratch])?;
+        self.push(Step::Attention(step));
+        Ok(to)
+    }
+
+    /// Attention of the queries over panels, into the result; both places of floats by now.
+    fn attend(
+        &self,
+        [q, to]: [&View; 2],
+        heads: &[[usize; 4]],
+        size: [usize; 3],
+        scale: f32,
+        [panels, scratch]: [usize; 2],
+    ) -> Try<Attention> {
+        let outer = q.shape.len() - 2;
+        Ok(Attention {
             heads: heads.iter().map(|h| [h[0], h[3]]).collect(),
-            queries,
+            queries: q.shape[outer],
             size,
             input: self.place(q.base, q.offset)?,
             input_row: q.stride[outer],
             panels,
-            output: address(&to)?,
+            output: address(to)?,
             output_row: to.stride[outer],
             scale,
             scratch,
-        }));
-        Ok(to)
+        })
     }
 
     /// A new tensor with heads side by side within each query, which is how they are used next.
@@ -442,7 +456,7 @@ impl Lower<'_, '_, '_> {
         let strides = [q, &k, &v, &to].map(|v| &v.stride[..outer]);
         let heads = offsets(&q.shape[..outer], strides);
         let eight = &self.planner.kernels.eight;
-        let scratch = self.planner.threads * AttentionBytes::scratch_len(size, eight);
+        let scratch = self.planner.threads * PackKvBytes::scratch_len(size, eight);
         let panels = heads.len() * PackKvBytes::len(size, eight);
         let (scratch, panels) = (self.buffer(scratch), self.buffer(panels));
         self.push(Step::PackKvBytes(PackKvBytes {
@@ -454,18 +468,8 @@ impl Lower<'_, '_, '_> {
             size,
             output: panels,
         }));
-        self.push(Step::AttentionBytes(AttentionBytes {
-            heads: heads.iter().map(|h| [h[0], h[3]]).collect(),
-            queries,
-            size,
-            input: self.place(q.base, q.offset)?,
-            input_row: q.stride[outer],
-            panels,
-            output: address(&to)?,
-            output_row: to.stride[outer],
-            scale,
-            scratch,
-        }));
+        let step = self.attend([q, &to], &heads, size, scale, [panels, scratch])?;
+        self.push(Step::AttentionBytes(step));
         Ok(to)
     }
 }
