@@ -1,10 +1,9 @@
 #!/bin/bash
-# `tsda run` on real V4L2 drivers without hardware: user-mode Linux (or QEMU) with vivid,
+# `tsda run` on real V4L2 drivers without hardware: user-mode Linux with vivid,
 # v4l2loopback, and a USB thermal camera played to the real uvcvideo.
 #
-#   tests/v4l2/run.sh [--qemu] [--require] [TEST...]      TESTs: vivid faults loopback uvc pair
+#   tests/v4l2/run.sh [--require] [TEST...]      TESTs: vivid faults loopback uvc pair
 #
-# --qemu, Debian's kernel under emulation, is there to be tried by hand: these tests are not known to pass on it.
 # Without --require it says why and ends with 0 where it cannot run (not root, no packages), and where
 # the kernel is not in the cache yet: building it takes minutes. TSDA_V4L2=1 builds it (CI does),
 # TSDA_V4L2=0 leaves the tests out.
@@ -15,10 +14,9 @@
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 root=$(cd "$here/../.." && pwd)
-back=--uml require= tests=()
+require= tests=()
 for a; do
   case $a in
-    --qemu) back= ;;
     --require) require=y ;;
     -*) sed -n '2,/^set -/{/^set -/d;s/^# \{0,1\}//p}' "$0"; exit 2 ;;
     *) tests+=("$a") ;;
@@ -43,8 +41,7 @@ skip() {
 command -v apt-get >/dev/null || skip "kernels come from Debian packages, and there is no apt-get"
 [ -n "$require" ] || [ "${TSDA_V4L2:-}" != 0 ] || skip "TSDA_V4L2=0"
 cache=${QEMU_V4L2_CACHE:-$HOME/.cache/qemu-v4l2-test}
-kernel=$cache/uml; [ -n "$back" ] || kernel=$cache/kernel
-if [ ! -e "$kernel/.done" ]; then
+if [ ! -e "$cache/uml/.done" ]; then
   [ -n "$require" ] || [ "${TSDA_V4L2:-}" = 1 ] ||
     skip "no kernel in $cache yet; TSDA_V4L2=1 builds it once (5 to 25 minutes)"
   [ "$(id -u)" = 0 ] || skip "needs root to install what builds the kernel"
@@ -64,7 +61,7 @@ has_clang || skip "no libclang, which building with cameras needs (apt-get insta
 log=$(mktemp -d)
 trap 'rm -rf "$log"' EXIT
 rc=0
-within "${KERNEL_LIMIT:-1500}" "$here/vm.sh" $back --vivid --loopback=2 --uvc --prepare >"$log/prepare" 2>&1 || rc=$?
+within "${KERNEL_LIMIT:-1500}" "$here/vm.sh" --vivid --loopback=2 --uvc --prepare >"$log/prepare" 2>&1 || rc=$?
 [ $rc != 124 ] || skip "the kernel was not built in time (KERNEL_LIMIT, TSDA_V4L2_LIMIT): this machine is too busy"
 [ $rc = 0 ] || skip "no kernel: $(tail -1 "$log/prepare")"
 echo "V4L2 tests: kernel there after $SECONDS s"
@@ -100,7 +97,7 @@ for t in "${tests[@]}"; do
     continue
   fi
   echo "== $t"
-  if within $((${LIMIT:-600} + 60)) "$here/vm.sh" $back "${devices[@]}" --timeout "${LIMIT:-600}" --mem 768 --out "$log/out-$t" \
+  if within $((${LIMIT:-600} + 60)) "$here/vm.sh" "${devices[@]}" --timeout "${LIMIT:-600}" --mem 768 --out "$log/out-$t" \
     --add "$PROBE:/bin/probe" --add "$log/clip:/data/clip" --add "$here/lib.sh:/data/lib.sh" \
     --sh "$here/t-$t.sh" "$TSDA"; then
     echo "== $t: ok, after $SECONDS s"
