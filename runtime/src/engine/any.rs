@@ -190,10 +190,10 @@ fn native_threads(threads: usize) -> Result<usize, String> {
     }
 }
 
-/// Reads `,threads=N,pin,isa=NAME,attention=floats`.
+/// Reads `,threads=N,pin,isa=NAME,attention=floats,convolution=direct`.
 #[cfg(feature = "native")]
 fn native_options(text: &str) -> Result<NativeOptions, String> {
-    const KNOWN: &str = "threads=N, pin, isa=NAME and attention=floats are";
+    const KNOWN: &str = "threads=N, pin, isa=NAME, attention=floats and convolution=direct are";
     let mut options = NativeOptions::default();
     if text.starts_with(':') {
         return Err(format!("it has no providers; {KNOWN} possible after a comma"));
@@ -212,6 +212,7 @@ fn native_options(text: &str) -> Result<NativeOptions, String> {
                 })?);
             }
             Some(("attention", "floats")) => options.float_attention = true,
+            Some(("convolution", "direct")) => options.direct_convolution = true,
             None if part == "pin" => options.pin = true,
             _ => return Err(format!("`{part}` is not known; {KNOWN}")),
         }
@@ -273,7 +274,8 @@ impl fmt::Display for EngineChoice {
                 if let Some(isa) = options.isa {
                     write!(f, ",isa={}", isa.name())?;
                 }
-                f.write_str(if options.float_attention { ",attention=floats" } else { "" })
+                f.write_str(if options.float_attention { ",attention=floats" } else { "" })?;
+                f.write_str(if options.direct_convolution { ",convolution=direct" } else { "" })
             }
             #[cfg(feature = "tract")]
             Self::Tract(options) => {
@@ -374,7 +376,7 @@ mod tests {
             "native",
             "native,threads=3",
             "native,threads=2,pin",
-            "native,isa=scalar,attention=floats",
+            "native,isa=scalar,attention=floats,convolution=direct",
         ] {
             assert_eq!(text.parse::<EngineChoice>().unwrap().to_string(), text);
         }

@@ -313,7 +313,7 @@ fn evaluate(bytes: &[u8], x: (&[usize], &[f32]), y: &[usize]) -> Vec<f32> {
     let mut graph = graph::read(bytes, &[]).unwrap();
     graph::fuse(&mut graph);
     let kernels = Isa::best().kernels().unwrap();
-    let mut planner = Planner::new(kernels, 2, 0, None);
+    let mut planner = Planner::new(kernels, 2, 0, 0, None);
     let (from, to) = (planner.lasting(x.1.len()), planner.lasting(y.iter().product()));
     let bind =
         |name, at, shape: &[usize]| Binding { name, view: View::dense(Base::Arena(at), shape) };

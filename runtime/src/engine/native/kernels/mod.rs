@@ -25,10 +25,12 @@ mod neon;
 mod norms;
 mod program;
 mod simd;
+mod step;
 mod table;
 mod team;
 #[cfg(test)]
 mod tests;
+mod winograd;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
@@ -39,9 +41,11 @@ pub use gemm::Gemm;
 pub use loops::{Copy, Fold, Map, Nest, Zip};
 pub use matmul::MatMul;
 pub use norms::{LayerNorm, MapNorm, Softmax};
-pub use program::{Program, Step};
+pub use program::Program;
+pub use step::Step;
 pub use table::{Isa, Kernels};
 pub use team::Team;
+pub use winograd::{FromPoints, Matrices, POINTS, ToPoints, transform};
 
 /// Where a tensor starts, in floats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -8,6 +8,7 @@ use super::loops::{self, Copy, Fold, Map, Zip};
 use super::matmul::{self, MatMul};
 use super::norms::{self, LayerNorm, MapNorm, Softmax};
 use super::simd::{Scalar, Simd};
+use super::winograd::{self, FromPoints, ToPoints};
 use super::{Mem, Part};
 
 /// Most rows of a tile.
@@ -92,6 +93,8 @@ pub struct Kernels {
     pub eight: Eight,
     pub(super) depthwise: unsafe fn(&Depthwise, Mem, Part),
     pub(super) pool: unsafe fn(&Pool, Mem, Part),
+    pub(super) to_points: unsafe fn(&ToPoints, Mem, Part),
+    pub(super) from_points: unsafe fn(&FromPoints, Mem, Part),
     pub(super) layer_norm: unsafe fn(&LayerNorm, Mem, Part),
     pub(super) softmax: unsafe fn(&Softmax, Mem, Part),
     pub(super) map_norm: unsafe fn(&MapNorm, Mem, Part),
@@ -126,6 +129,9 @@ macro_rules! table {
                 tile<R, NV>(t: &Tile) => gemm::tile::<$set, R, NV>(t);
                 depthwise(s: &Depthwise, m: Mem, p: Part) => conv::depthwise::<$set>(s, m, p);
                 pool(s: &Pool, m: Mem, p: Part) => conv::pool::<$set>(s, m, p);
+                to_points(s: &ToPoints, m: Mem, p: Part) => winograd::to_points::<$set>(s, m, p);
+                from_points(s: &FromPoints, m: Mem, p: Part)
+                    => winograd::from_points::<$set>(s, m, p);
                 layer_norm(s: &LayerNorm, m: Mem, p: Part) => norms::layer_norm::<$set>(s, m, p);
                 softmax(s: &Softmax, m: Mem, p: Part) => norms::softmax::<$set>(s, m, p);
                 map_norm(s: &MapNorm, m: Mem, p: Part) => norms::map_norm::<$set>(s, m, p);
@@ -153,6 +159,8 @@ macro_rules! table {
                 eight: $eight,
                 depthwise,
                 pool,
+                to_points,
+                from_points,
                 layer_norm,
                 softmax,
                 map_norm,

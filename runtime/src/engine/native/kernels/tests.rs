@@ -3,6 +3,7 @@
 
 mod eight;
 mod loops;
+mod winograd;
 
 use super::*;
 use crate::engine::native::graph::{Binary, Reduce, Unary};

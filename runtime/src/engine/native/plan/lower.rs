@@ -2,6 +2,7 @@
 
 mod bytes;
 mod products;
+mod winograd;
 
 use super::super::graph::{Binary, Data, Graph, GraphError, Node, Op, Reduce, Unary, Window};
 use super::super::kernels::{

@@ -44,6 +44,8 @@ enum Made {
     Copy(Source, usize, Vec<usize>, Vec<usize>),
     /// Packed for products, from this offset.
     Packed(Source, usize, Vec<usize>, Vec<usize>),
+    /// Kernels of 3 x 3 transformed and packed for products.
+    Points(Source),
     /// Padded to whole vectors.
     Padded(Source, usize),
     /// Bytes packed for products.
@@ -131,6 +133,8 @@ pub struct Planner {
     mapping: Option<Arc<Mapping>>,
     made: HashMap<Made, usize>,
     lasting: usize,
+    /// Floats by which transformed weights may still grow.
+    spare: usize,
     /// Whether attention in graphs with products of bytes is computed in bytes too.
     byte_attention: bool,
     /// Computed once, from constants only.
@@ -142,14 +146,15 @@ pub struct Planner {
 
 impl Planner {
     /// For an instruction set and a number of threads. `weights` is about how many floats there
-    /// will be; `mapping` the file they come from, which gets its memory back piece by piece.
+    /// will be, `spare` by how many more they may grow where that saves time; `mapping` the file they come from, which gets its memory back piece by piece.
     pub fn new(
         kernels: &'static Kernels,
         threads: usize,
         weights: usize,
+        spare: usize,
         mapping: Option<Arc<Mapping>>,
     ) -> Self {
-        let mut weights: Vec<f32> = Vec::with_capacity(weights + ALIGN);
+        let mut weights: Vec<f32> = Vec::with_capacity(weights + spare + ALIGN);
         // Where that cannot be said, it is all the same: kernels work with any alignment.
         let origin = Some(weights.as_ptr().align_offset(4 * ALIGN)).filter(|&n| n < ALIGN);
         weights.resize(origin.unwrap_or(0), 0.0);
@@ -161,6 +166,7 @@ impl Planner {
             mapping,
             made: HashMap::new(),
             lasting: 0,
+            spare,
             byte_attention: false,
             once: Default::default(),
             once_buffers: Vec::new(),

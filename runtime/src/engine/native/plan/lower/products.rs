@@ -12,7 +12,7 @@ use super::bytes::Operands;
 use super::{Lower, TOO_MANY, Try, address, four};
 
 /// Floats of input and output rows that stay in the second-level cache beside a panel of weights.
-const BLOCK: usize = 96 * 1024;
+pub(super) const BLOCK: usize = 96 * 1024;
 /// Queries up to which attention reads keys and values where they lie.
 const THIN: usize = 16;
 
@@ -83,6 +83,13 @@ impl Lower<'_, '_, '_> {
             }
             None => None,
         };
+        if bytes.is_none()
+            && group == 1
+            && let Some(points) = self.points(weights, window, [oh, ow])?
+        {
+            self.winograd(points, [channels, n], &source, &target, residual, post)?;
+            return Ok(target.view);
+        }
         // The pixels of a window's line are one run when nothing lies between them.
         let joined = group == 1 && pitch.x == depth && window.dilation[1] == 1;
         let (taps, run): (Box<[usize]>, usize) =

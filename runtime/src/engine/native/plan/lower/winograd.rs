@@ -1,0 +1,150 @@
+//! 3 x 3 convolutions as products of transformed windows and weights, where that is less work and
+//! the weights, which grow by 7/9, may still grow.
+
+use super::super::super::graph::{Post, Window};
+use super::super::super::kernels::{
+    FromPoints, Gemm, Matrices, POINTS, Pitch, Place, Step, ToPoints, transform,
+};
+use super::super::view::Base;
+use super::super::{ALIGN, Made, spread};
+use super::{Lower, MapSource, MapTarget, Try, four};
+
+/// Fewest input or output channels: with fewer the transforms cost what the products save.
+const CHANNELS: usize = 32;
+/// Fewest full tiles of rows in a product.
+const ROWS: usize = 3;
+/// Floats of points, before and after the products, that are worked on at a time: they stay in the
+/// second-level cache.
+const BLOCK: usize = 256 * 1024;
+/// Full tiles of rows in a block, at least: weights are read once per block.
+const BLOCK_ROWS: usize = 8;
+
+impl Lower<'_, '_, '_> {
+    /// The transformed weights of a convolution of one group over floats, if it is one for this way:
+    /// 3 x 3, every pixel, one pixel of border, a result of even size.
+    pub(super) fn points(
+        &mut self,
+        id: usize,
+        window: &Window,
+        size: [usize; 2],
+    ) -> Try<Option<usize>> {
+        let [n, channels, kh, kw] = four(self.graph.shape(id))?;
+        let fits = [kh, kw] == [3, 3]
+            && window.stride == [1, 1]
+            && window.dilation == [1, 1]
+            && window.pad == [1, 1, 1, 1]
+            && size.iter().all(|n| n.is_multiple_of(2))
+            && size[0] * size[1] / 4 >= ROWS * self.planner.kernels.rows
+            && channels.min(n) >= CHANNELS;
+        if !fits || self.once {
+            return Ok(None);
+        }
+        let (data, from) = self.constant(id)?;
+        let made = Made::Points(from);
+        let grown = (POINTS - 9) * channels * n;
+        if !self.planner.made.contains_key(&made) {
+            let Some(left) = self.planner.spare.checked_sub(grown) else { return Ok(None) };
+            self.planner.spare = left;
+        }
+        let packing = self.planner.kernels.packing;
+        Ok(Some(self.planner.make(made, || {
+            let mut points = vec![0.0; POINTS * channels * n];
+            for (at, kernel) in data.chunks_exact(9).enumerate() {
+                let (column, channel) = (at / channels, at % channels);
+                let kernel = core::array::from_fn(|y| core::array::from_fn(|x| kernel[3 * y + x]));
+                for (p, v) in transform(kernel).into_iter().enumerate() {
+                    points[(p * channels + channel) * n + column] = v;
+                }
+            }
+            let mut packed = Vec::with_capacity(POINTS * packing.len(channels, n));
+            for matrix in points.chunks_exact(channels * n) {
+                let row = |k: usize, out: &mut [f32]| out.copy_from_slice(&matrix[k * n..][..n]);
+                packing.pack(channels, n, row, &mut packed);
+            }
+            packed
+        })))
+    }
+
+    /// The convolution with those weights, block by block of lines of the result.
+    pub(super) fn winograd(
+        &mut self,
+        weights: usize,
+        [channels, columns]: [usize; 2],
+        source: &MapSource,
+        target: &MapTarget,
+        residual: Option<(Place, Pitch)>,
+        post: &Post,
+    ) -> Try<()> {
+        let Base::Arena(at) = source.base else { return Err("an input that is constant".into()) };
+        let pitch = source.pitch;
+        let start = at + source.offset - pitch.y - pitch.x;
+        let bias = self.channels(post.bias, columns, true)?;
+        let [_, _, oh, ow] = four(&target.view.shape)?;
+        let (all, across) = (oh / 2, ow / 2);
+        let row = |n: usize| {
+            let n = n.next_multiple_of(ALIGN);
+            n + spread(n)
+        };
+        let (row_in, row_out) = (row(channels), row(columns));
+        let tiles =
+            (BLOCK / (POINTS * (row_in + row_out))).max(BLOCK_ROWS * self.planner.kernels.rows);
+        let blocks = all.div_ceil(tiles.div_ceil(across));
+        let lines = all.div_ceil(blocks);
+        let mut matrices = |row: usize| {
+            let matrix = lines * across * row;
+            let matrix = matrix + spread(matrix);
+            Matrices { start: self.buffer(POINTS * matrix), row, matrix }
+        };
+        let (before, after) = (matrices(row_in), matrices(row_out));
+        if let Some(border) = target.halo {
+            self.push(Step::Clear(border));
+        }
+        let packing = self.planner.kernels.packing;
+        for first in (0..all).step_by(lines) {
+            let size = [lines.min(all - first), across];
+            let below = |place: Place, pitch: Pitch| match place {
+                Place::Arena(at) => Place::Arena(at + 2 * first * pitch.y),
+                Place::Weights(at) => Place::Weights(at + 2 * first * pitch.y),
+            };
+            self.push(Step::ToPoints(ToPoints {
+                size,
+                channels,
+                input: below(Place::Arena(start), pitch),
+                input_pitch: pitch,
+                output: before,
+            }));
+            for p in 0..POINTS {
+                self.push(Step::Gemm(Gemm {
+                    size: [1, size[0] * size[1]],
+                    input: Place::Arena(before.start + p * before.matrix),
+                    input_pitch: Pitch { y: 0, x: row_in },
+                    taps: [0].into(),
+                    run: channels,
+                    weights: weights + p * packing.len(channels, columns),
+                    bias: None,
+                    columns,
+                    output: after.start + p * after.matrix,
+                    output_pitch: Pitch { y: 0, x: row_out },
+                    residual: None,
+                    swish: false,
+                    clamp: (f32::NEG_INFINITY, f32::INFINITY),
+                    halo: None,
+                    block: super::products::BLOCK / channels,
+                    scales: None,
+                }));
+            }
+            self.push(Step::FromPoints(FromPoints {
+                size,
+                columns,
+                input: after,
+                bias,
+                output: target.output + 2 * first * target.pitch.y,
+                output_pitch: target.pitch,
+                residual: residual.map(|(place, pitch)| (below(place, pitch), pitch)),
+                swish: post.swish,
+                clamp: post.clamp,
+            }));
+        }
+        Ok(())
+    }
+}
