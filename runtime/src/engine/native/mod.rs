@@ -44,7 +44,7 @@ pub struct NativeOptions {
     /// Whether attention stays in floats where the products around it are of bytes.
     pub float_attention: bool,
     /// Whether 3 x 3 convolutions over floats stay what they are. Otherwise those whose transformed
-    /// weights fit into a tenth more memory are computed with 16 multiplications in the place of 36.
+    /// weights fit into a ninth more memory are computed with 16 multiplications in the place of 36.
     pub direct_convolution: bool,
 }
 
@@ -198,7 +198,7 @@ impl NativeEngine {
         let weights = bundle.section(SectionKind::Weights).unwrap_or_default().len() / 4;
         let spare = match options.direct_convolution {
             true => 0,
-            false => (weights / 10).max(LEAST_SPARE),
+            false => (weights / 9).max(LEAST_SPARE),
         };
         let mut planner =
             Planner::new(kernels, threads, weights + weights / 16, spare, bundle.mapping());
