@@ -6,7 +6,7 @@ use super::super::super::kernels::{
     FromPoints, Gemm, Matrices, POINTS, Pitch, Place, Step, ToPoints, transform,
 };
 use super::super::view::Base;
-use super::super::{ALIGN, Made, spread};
+use super::super::{ALIGN, Made, source, spread};
 use super::{Lower, MapSource, MapTarget, Try, four};
 
 /// Fewest input or output channels: with fewer the transforms cost what the products save.
@@ -39,13 +39,15 @@ impl Lower<'_, '_, '_> {
         if !fits || self.once {
             return Ok(None);
         }
-        let (data, from) = self.constant(id)?;
-        let made = Made::Points(from);
-        let grown = (POINTS - 9) * channels * n;
-        if !self.planner.made.contains_key(&made) {
-            let Some(left) = self.planner.spare.checked_sub(grown) else { return Ok(None) };
-            self.planner.spare = left;
+        let data = self.graph.values[id].data.as_ref().ok_or("an operand is not constant")?;
+        let made = Made::Points(source(self.index, id, data));
+        if let Some(&at) = self.planner.made.get(&made) {
+            return Ok(Some(at));
         }
+        let grown = (POINTS - 9) * channels * n;
+        let Some(left) = self.planner.spare.checked_sub(grown) else { return Ok(None) };
+        self.planner.spare = left;
+        let (data, _) = self.constant(id)?;
         let packing = self.planner.kernels.packing;
         Ok(Some(self.planner.make(made, || {
             let mut points = vec![0.0; POINTS * channels * n];
