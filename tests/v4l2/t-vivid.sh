@@ -46,9 +46,14 @@ judged() {
 # the driver's buffers hold pictures that are older than that.
 config still $D YUYV 640x480 "rate = 30.0"; begin still
 until_true 30 goes_on still 0 10 || fail "no pictures"
-for _ in 1 2 3 4 5 6; do kill -STOP $pid; sleep 1; kill -CONT $pid; sleep 1; done
+# On a busy machine a picture may be judged late before it is tracked: again, until three are seen.
+latencies() { sed -n 's/.*"predicted":false.*"latency_ms":\([0-9.]*\),"track_ms":\([0-9.]*\).*/\1 \2/p' /out/still.jsonl | awk '$1 - $2 > 400 { n++ } $1 - $2 < 200 { soon++ } $1 > 15000 { wrong++ } END { print (n >= 3 && soon >= 10 && !wrong) ? "ok" : "bad", n + 0, soon + 0, wrong + 0 }'; }
+for _ in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20; do
+  kill -STOP $pid; sleep 1; kill -CONT $pid; sleep 1
+  case $(latencies) in ok*) break ;; esac
+done
 end still "standing still"
-late=$(sed -n 's/.*"predicted":false.*"latency_ms":\([0-9.]*\),"track_ms":\([0-9.]*\).*/\1 \2/p' /out/still.jsonl | awk '$1 - $2 > 400 { n++ } $1 - $2 < 200 { soon++ } $1 > 15000 { wrong++ } END { print (n >= 3 && soon >= 10 && !wrong) ? "ok" : "bad", n + 0, soon + 0, wrong + 0 }')
+late=$(latencies)
 case $late in ok*) ok "latency begins at the driver's time stamp: ${late#ok } late, soon, wrong" ;; *) fail "latency: $late" ;; esac
 [ "$(figure still 'passed over')" -ge 4 ] && ok "older pictures are passed over" || fail "passed over: $(tail -2 /out/still.err)"
 no_panic
