@@ -7,7 +7,8 @@
 //! ```
 //!
 //! While nothing is counted and no pool is in use, an allocation costs two loads of a number that
-//! nobody writes and the change of one that is the thread's own; the loop of the native engine, which allocates nothing, does not notice it.
+//! nobody writes and the change of one that is the thread's own; the loop of the native engine, which
+//! allocates nothing, does not notice it.
 //! Unsafe: `GlobalAlloc` is an unsafe trait.
 
 use std::alloc::{GlobalAlloc, Layout, System};

@@ -29,8 +29,12 @@ pub use plan::ProgramSummary;
 pub use session::GraphSession;
 
 const NAME: &str = "native";
-/// Floats that transformed weights of small networks may take more than others: 2 MiB.
-const LEAST_SPARE: usize = 512 * 1024;
+
+/// Floats by which so many weights may grow where that saves time: a ninth, 2 MiB at least.
+const fn spare(weights: usize) -> usize {
+    let (share, least) = (weights / 9, 512 * 1024);
+    if share > least { share } else { least }
+}
 
 /// How to run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -196,10 +200,7 @@ impl NativeEngine {
         let spec = bundle.manifest().spec;
         let graphs = Graphs::read(bundle, spec.templates)?;
         let weights = bundle.section(SectionKind::Weights).unwrap_or_default().len() / 4;
-        let spare = match options.direct_convolution {
-            true => 0,
-            false => (weights / 9).max(LEAST_SPARE),
-        };
+        let spare = if options.direct_convolution { 0 } else { spare(weights) };
         let mut planner =
             Planner::new(kernels, threads, weights + weights / 16, spare, bundle.mapping());
         if !options.float_attention {

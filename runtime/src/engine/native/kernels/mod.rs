@@ -56,6 +56,16 @@ pub enum Place {
     Weights(usize),
 }
 
+impl Place {
+    /// So many floats further on.
+    pub const fn beyond(self, floats: usize) -> Self {
+        match self {
+            Self::Arena(at) => Self::Arena(at + floats),
+            Self::Weights(at) => Self::Weights(at + floats),
+        }
+    }
+}
+
 /// Rows of pixels: `h` lines of `w` pixels, each a run of channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Pitch {

@@ -88,6 +88,20 @@ pub fn transform(g: [[f32; 3]; 3]) -> [f32; POINTS] {
     out
 }
 
+/// Four pixels in a row to points (`B'd`).
+#[inline(always)]
+unsafe fn four<S: Simd>([a, b, c, d]: [S::V; 4]) -> [S::V; 4] {
+    // SAFETY: the caller promises the instruction set.
+    unsafe { [S::sub(a, c), S::add(b, c), S::sub(c, b), S::sub(b, d)] }
+}
+
+/// Four points to two pixels in a row (`A'm`).
+#[inline(always)]
+unsafe fn two<S: Simd>([a, b, c, d]: [S::V; 4]) -> [S::V; 2] {
+    // SAFETY: the caller promises the instruction set.
+    unsafe { [S::add(S::add(a, b), c), S::sub(S::sub(b, c), d)] }
+}
+
 /// # Safety
 /// The step was checked, the instruction set is there, nobody else touches the result.
 #[inline(always)]
@@ -110,12 +124,10 @@ pub unsafe fn to_points<S: Simd>(s: &ToPoints, mem: Mem, part: Part) {
                     };
                     let mut d = [[S::splat(0.0); 4]; 4];
                     for y in 0..4 {
-                        let [a, b, c, e] = [load(y, 0), load(y, 1), load(y, 2), load(y, 3)];
-                        d[y] = [S::sub(a, c), S::add(b, c), S::sub(c, b), S::sub(b, e)];
+                        d[y] = four::<S>([load(y, 0), load(y, 1), load(y, 2), load(y, 3)]);
                     }
                     for x in 0..4 {
-                        let [a, b, c, e] = [d[0][x], d[1][x], d[2][x], d[3][x]];
-                        let column = [S::sub(a, c), S::add(b, c), S::sub(c, b), S::sub(b, e)];
+                        let column = four::<S>([d[0][x], d[1][x], d[2][x], d[3][x]]);
                         for y in 0..4 {
                             let at = out.add((4 * y + x) * s.output.matrix + channel);
                             if whole {
@@ -152,17 +164,14 @@ pub unsafe fn from_points<S: Simd>(s: &FromPoints, mem: Mem, part: Part) {
                     let mut lines = [[S::splat(0.0); 4]; 2];
                     for x in 0..4 {
                         let m = |y: usize| load(points.add((4 * y + x) * s.input.matrix + channel));
-                        let [a, b, c, e] = [m(0), m(1), m(2), m(3)];
-                        lines[0][x] = S::add(S::add(a, b), c);
-                        lines[1][x] = S::sub(S::sub(b, c), e);
+                        [lines[0][x], lines[1][x]] = two::<S>([m(0), m(1), m(2), m(3)]);
                     }
                     let bias = match s.bias {
                         Some(at) => load(mem.weights.add(at + channel)),
                         None => S::splat(0.0),
                     };
                     for y in 0..2 {
-                        let [a, b, c, e] = lines[y];
-                        let pixels = [S::add(S::add(a, b), c), S::sub(S::sub(b, c), e)];
+                        let pixels = two::<S>(lines[y]);
                         for x in 0..2 {
                             let mut v = S::add(pixels[x], bias);
                             let (py, px) = (2 * line + y, 2 * column + x);

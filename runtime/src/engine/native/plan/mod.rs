@@ -146,7 +146,8 @@ pub struct Planner {
 
 impl Planner {
     /// For an instruction set and a number of threads. `weights` is about how many floats there
-    /// will be, `spare` by how many more they may grow where that saves time; `mapping` the file they come from, which gets its memory back piece by piece.
+    /// will be, `spare` by how many more they may grow where that saves time; `mapping` the file they
+    /// come from, which gets its memory back piece by piece.
     pub fn new(
         kernels: &'static Kernels,
         threads: usize,

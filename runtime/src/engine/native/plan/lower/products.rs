@@ -12,7 +12,7 @@ use super::bytes::Operands;
 use super::{Lower, TOO_MANY, Try, address, four};
 
 /// Floats of input and output rows that stay in the second-level cache beside a panel of weights.
-pub(super) const BLOCK: usize = 96 * 1024;
+const BLOCK: usize = 96 * 1024;
 /// Queries up to which attention reads keys and values where they lie.
 const THIN: usize = 16;
 
@@ -119,17 +119,10 @@ impl Lower<'_, '_, '_> {
                     Operands { weights, bias, scales: None }
                 }
             };
-            let input = match start {
-                Place::Arena(at) => Place::Arena(at + g * per_group),
-                Place::Weights(at) => Place::Weights(at + g * per_group),
-            };
-            let shifted = |(place, pitch): (Place, Pitch)| match place {
-                Place::Arena(at) => (Place::Arena(at + g * columns), pitch),
-                Place::Weights(at) => (Place::Weights(at + g * columns), pitch),
-            };
+            let shifted = |(place, pitch): (Place, Pitch)| (place.beyond(g * columns), pitch);
             self.push(Step::Gemm(Gemm {
                 size: [oh, ow],
-                input,
+                input: start.beyond(g * per_group),
                 input_pitch: stride,
                 taps: taps.clone(),
                 run,
@@ -239,7 +232,9 @@ impl Lower<'_, '_, '_> {
         Ok(to)
     }
 
-    fn gemm(
+    /// A product with a constant matrix of `depth` rows, of tensors whose rows lie like this; weights
+    /// and columns are for `rest` to say.
+    pub(super) fn gemm(
         &mut self,
         a: &View,
         size: [usize; 2],

@@ -5,7 +5,7 @@ use super::super::super::graph::{Post, Window};
 use super::super::super::kernels::{
     FromPoints, Gemm, Matrices, POINTS, Pitch, Place, Step, ToPoints, transform,
 };
-use super::super::view::Base;
+use super::super::view::{Base, View};
 use super::super::{ALIGN, Made, source, spread};
 use super::{Lower, MapSource, MapTarget, Try, four};
 
@@ -102,38 +102,23 @@ impl Lower<'_, '_, '_> {
             self.push(Step::Clear(border));
         }
         let packing = self.planner.kernels.packing;
+        let pitches = (Pitch { y: 0, x: row_in }, Pitch { y: 0, x: row_out });
         for first in (0..all).step_by(lines) {
             let size = [lines.min(all - first), across];
-            let below = |place: Place, pitch: Pitch| match place {
-                Place::Arena(at) => Place::Arena(at + 2 * first * pitch.y),
-                Place::Weights(at) => Place::Weights(at + 2 * first * pitch.y),
-            };
             self.push(Step::ToPoints(ToPoints {
                 size,
                 channels,
-                input: below(Place::Arena(start), pitch),
+                input: Place::Arena(start + 2 * first * pitch.y),
                 input_pitch: pitch,
                 output: before,
             }));
             for p in 0..POINTS {
-                self.push(Step::Gemm(Gemm {
-                    size: [1, size[0] * size[1]],
-                    input: Place::Arena(before.start + p * before.matrix),
-                    input_pitch: Pitch { y: 0, x: row_in },
-                    taps: [0].into(),
-                    run: channels,
-                    weights: weights + p * packing.len(channels, columns),
-                    bias: None,
-                    columns,
-                    output: after.start + p * after.matrix,
-                    output_pitch: Pitch { y: 0, x: row_out },
-                    residual: None,
-                    swish: false,
-                    clamp: (f32::NEG_INFINITY, f32::INFINITY),
-                    halo: None,
-                    block: super::products::BLOCK / channels,
-                    scales: None,
-                }));
+                let matrix = |m: &Matrices| View::dense(Base::Arena(m.start + p * m.matrix), &[]);
+                let (rows, weights) =
+                    ([1, size[0] * size[1]], weights + p * packing.len(channels, columns));
+                self.gemm(&matrix(&before), rows, pitches, channels, &matrix(&after), |gemm| {
+                    Gemm { weights, columns, ..gemm }
+                })?;
             }
             self.push(Step::FromPoints(FromPoints {
                 size,
@@ -142,7 +127,7 @@ impl Lower<'_, '_, '_> {
                 bias,
                 output: target.output + 2 * first * target.pitch.y,
                 output_pitch: target.pitch,
-                residual: residual.map(|(place, pitch)| (below(place, pitch), pitch)),
+                residual: residual.map(|(place, pitch)| (place.beyond(2 * first * pitch.y), pitch)),
                 swish: post.swish,
                 clamp: post.clamp,
             }));
