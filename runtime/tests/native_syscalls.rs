@@ -4,12 +4,15 @@
 
 use std::collections::BTreeMap;
 use std::io::Write as _;
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 use tsda_runtime::bundle::BundleFile;
 use tsda_runtime::engine::native::{NativeEngine, NativeOptions};
 use tsda_runtime::{BBox, FrameView, Modality, PixelFormat, Tracker, TrackerParams, probe};
 
 const FRAMES: usize = 200;
+/// They take under a second; a hang shall not use up the time of all tests.
+const LIMIT: Duration = Duration::from_secs(300);
 const BEGIN: &str = "tsda-frames-begin";
 const END: &str = "tsda-frames-end";
 const WIDTH: usize = 320;
@@ -22,16 +25,26 @@ fn main() {
     }
     let log = std::env::temp_dir().join(format!("tsda-strace-{}", std::process::id()));
     for threads in [1, 2] {
-        let output = Command::new("strace")
+        let child = Command::new("strace")
             .args(["-f", "-qq", "-o"])
             .arg(&log)
             .arg(std::env::current_exe().unwrap())
             .env("TSDA_TRACE_THREADS", threads.to_string())
-            .output();
-        let output = match output {
-            Ok(output) => output,
+            .stderr(Stdio::piped())
+            .spawn();
+        let mut child = match child {
+            Ok(child) => child,
             Err(e) => return println!("skipped: strace cannot be started ({e}); install strace"),
         };
+        let begin = Instant::now();
+        while child.try_wait().unwrap().is_none() {
+            if begin.elapsed() > LIMIT {
+                child.kill().unwrap();
+                panic!("{threads} thread(s): {FRAMES} frames under strace took over {LIMIT:?}");
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let output = child.wait_with_output().unwrap();
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         if !said.contains(END) {
             assert!(!said.contains(BEGIN), "the frames were not finished: {said}");
