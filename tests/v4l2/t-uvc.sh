@@ -4,10 +4,12 @@ play() { /bin/probe usbcam "$@" >/tmp/usb.log 2>&1 & usb=$!; ready /dev/video0; 
 gone() { [ ! -e /dev/video0 ]; }
 unplug() { kill $usb 2>/dev/null; wait $usb 2>/dev/null; until_true 10 gone || fail "the camera is still there"; }
 nodrop() { echo $1 >/sys/module/uvcvideo/parameters/nodrop || echo "skipped: this kernel has no nodrop: what it does with damaged frames is not chosen"; }
-# warm NAME WHAT: the temperature in the box is that of the scene
+# warm NAME WHAT: the box shows the background, 20 to 22 degrees, and where the target has come in its 37
 warm() {
-  c=$(sed -n 's/.*"celsius":{"mean":\([0-9.]*\).*/\1/p' /out/$1.jsonl | head -1)
-  if [ $rc = 0 ] && awk -v c="$c" 'BEGIN { exit !(c > 19.5 && c < 23) }'; then ok "$2: $c degrees"; else fail "$2: exit $rc, $c degrees: $(tail -1 /out/$1.err)"; fi
+  c=$(sed -n 's/.*"celsius":{"mean":\([0-9.]*\),"max":\([0-9.]*\)}.*/\1 \2/p' /out/$1.jsonl | head -1)
+  if [ $rc = 0 ] && echo "$c" | awk '{ exit !($1 > 19.5 && $1 <= $2 && ($2 < 22.5 || $2 > 36.9 && $2 < 37.1)) }'; then
+    ok "$2: $c degrees, mean and warmest"
+  else fail "$2: exit $rc, $c degrees: $(tail -1 /out/$1.err)"; fi
 }
 # counted NAME WHAT WORD
 counted() { [ "$(figure $1 $3)" -ge 1 ] && ok "$2: $(figure $1 $3) $3" || fail "$2: no $3: $(tail -2 /out/$1.err)"; }
@@ -20,13 +22,17 @@ PROFILE=lepton config lepton160x120 /dev/video0 Y16 160x120; run lepton160x120 -
 [ $rc = 0 ] && ! has lepton160x120 celsius && ok "PureThermal 160x120: no temperature" || fail "PureThermal 160x120: exit $rc, a temperature that nobody stands for"
 PROFILE=lepton SCALE=0.01 config stated /dev/video0 Y16 160x120; run stated --frames 20; rc=$?
 warm stated "PureThermal 160x120 with its scale"
-# The telemetry rows say when the shutter is closed.
+# The telemetry rows say when the shutter is closed. It may be when the run begins; then nobody has taken the
+# target yet, so the test begins with the next time.
 begin lepton160x122
-until_true 30 has lepton160x122 '"camera_lost","source":"cam","reason":"shutter"' && ok "shutter: seen" || fail "shutter: not seen: $(tail -2 /out/lepton160x122.err)"
+until_true 30 goes_on lepton160x122 0 5 || fail "shutter: no pictures: $(tail -2 /out/lepton160x122.err)"
+from=$(lines lepton160x122)
+since() { tail -n +$(($from + 1)) /out/lepton160x122.jsonl | grep -q "$1"; }
+until_true 30 since '"camera_lost","source":"cam","reason":"shutter"' && ok "shutter: seen" || fail "shutter: not seen: $(tail -2 /out/lepton160x122.err)"
+until_true 20 since '"picture":"shutter","box":\[.*"predicted":true' && ok "shutter: predicted" || fail "shutter: not predicted"
 from=$(lines lepton160x122); until_true 20 goes_on lepton160x122 $from 5 && has lepton160x122 camera_back && ok "shutter: over" || fail "shutter: not over"
 end lepton160x122 shutter
-has lepton160x122 '"picture":"shutter","box":[^}]*"predicted":true' && ok "shutter: predicted" || fail "shutter: not predicted"
-grep '"picture":"shutter"' /out/lepton160x122.jsonl | grep -q '"predicted":false' && fail "shutter: tracked in"
+grep '"picture":"shutter","box":\[' /out/lepton160x122.jsonl | grep -q '"predicted":false' && fail "shutter: tracked in"
 PROFILE=lepton config uyvy /dev/video0 UYVY 160x120; run uyvy --frames 10; rc=$?
 [ $rc = 0 ] && [ "$(good uyvy 0)" -ge 8 ] && ok "PureThermal UYVY" || fail "PureThermal UYVY: exit $rc: $(tail -1 /out/uyvy.err)"
 config grey /dev/video0 GREY 160x120; run grey --frames 10; rc=$?
@@ -58,7 +64,7 @@ for kind in error short; do
     counted $n "USB $kind, nodrop=${mode%:*}" ${mode#*:}
     unplug
   done
-  grep '"picture":"damaged"' /out/${kind}1.jsonl | grep -q '"predicted":false' && fail "$kind: tracked in a damaged picture"
+  grep '"picture":"damaged","box":\[' /out/${kind}1.jsonl | grep -q '"predicted":false' && fail "$kind: tracked in a damaged picture"
 done
 nodrop 0
 play purethermal --fps 9 --stall-at 30 --stall-ms 2500
