@@ -7,9 +7,13 @@
 //!
 //! Positions here are pixel-centre coordinates (vertical first), as everywhere in the tracker.
 
-use crate::frame::{FrameView, PixelFormat};
+use crate::frame::FrameView;
 use crate::geometry::{BBox, Yx};
 use crate::spec::ModelSpec;
+
+mod sample;
+
+pub use sample::reference;
 
 /// What happens when a crop reaches over the picture's edge.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -235,76 +239,8 @@ fn to_int(v: f32) -> i64 {
     (v as i64).clamp(-(1 << 40), 1 << 40)
 }
 
-/// Resamples a window bit-faithfully to the reference (spec 3.4, step 9; spec 1.1): bilinear with
-/// half-pixel centres, no antialias, values stay real-valued, then
-/// `(value / 255 - mean) / std` into `out`, `(3, side, side)` in the order R, G, B.
-///
-/// # Errors
-/// When `out` has not exactly three planes of [`Window::output`] squared.
-pub fn reference(
-    frame: &FrameView<'_>,
-    window: &Window,
-    spec: &ModelSpec,
-    out: &mut [f32],
-) -> Result<(), CropError> {
-    let side = window.output();
-    let needed = 3 * side * side;
-    if out.len() != needed || side == 0 {
-        return Err(CropError::Output { len: out.len(), needed });
-    }
-    let (mean, std) = (&spec.input_mean, &spec.input_std);
-    let norm = |c: usize, v: f32| (v / 255.0 - mean[c]) / std[c];
-    let (data, stride) = (frame.data(), frame.stride());
-    match frame.format() {
-        PixelFormat::Rgb8 => resample(window, out, norm, |y, x| {
-            let p = y * stride + 3 * x;
-            [data[p].into(), data[p + 1].into(), data[p + 2].into()]
-        }),
-        PixelFormat::Bgr8 => resample(window, out, norm, |y, x| {
-            let p = y * stride + 3 * x;
-            [data[p + 2].into(), data[p + 1].into(), data[p].into()]
-        }),
-        PixelFormat::Gray8 => resample(window, out, norm, |y, x| [data[y * stride + x].into()]),
-        PixelFormat::Y16 { low, high } => {
-            let gain = 255.0 / (f32::from(high) - f32::from(low)).max(1.0);
-            resample(window, out, norm, |y, x| {
-                let p = y * stride + 2 * x;
-                let raw = u16::from_le_bytes([data[p], data[p + 1]]).clamp(low, high);
-                [f32::from(raw - low) * gain]
-            });
-        }
-        PixelFormat::Yuyv => resample(window, out, norm, |y, x| {
-            let pair = y * stride + (x / 2) * 4;
-            yuv_to_rgb(data[y * stride + 2 * x], data[pair + 1], data[pair + 3])
-        }),
-        PixelFormat::Uyvy => resample(window, out, norm, |y, x| {
-            let pair = y * stride + (x / 2) * 4;
-            yuv_to_rgb(data[y * stride + 2 * x + 1], data[pair], data[pair + 2])
-        }),
-        PixelFormat::Nv12 => {
-            let chroma = frame.height() * stride;
-            resample(window, out, norm, |y, x| {
-                let pair = chroma + (y / 2) * stride + (x / 2) * 2;
-                yuv_to_rgb(data[y * stride + x], data[pair], data[pair + 1])
-            });
-        }
-    }
-    Ok(())
-}
-
-/// BT.601 limited range to 0..255, real-valued.
-fn yuv_to_rgb(y: u8, u: u8, v: u8) -> [f32; 3] {
-    let y = 1.164_383_6 * (f32::from(y) - 16.0);
-    let (u, v) = (f32::from(u) - 128.0, f32::from(v) - 128.0);
-    [
-        (y + 1.596_026_8 * v).clamp(0.0, 255.0),
-        (y - 0.391_762_3 * u - 0.812_967_65 * v).clamp(0.0, 255.0),
-        (y + 2.017_232_2 * u).clamp(0.0, 255.0),
-    ]
-}
-
-/// Where one output coordinate reads: two picture coordinates and the weight of the second.
-#[derive(Clone, Copy)]
+/// Where one output coordinate reads: two coordinates and the weight of the second.
+#[derive(Clone, Copy, Default)]
 struct Tap {
     near: usize,
     far: usize,
@@ -323,56 +259,6 @@ impl Axis {
         Tap { near: pixel(index), far: pixel(far), weight: source - index as f32 }
     }
 }
-
-/// The loop over the output; `fetch(row, column)` reads a pixel with `C` channels, 1 or 3.
-fn resample<const C: usize>(
-    window: &Window,
-    out: &mut [f32],
-    norm: impl Fn(usize, f32) -> f32,
-    fetch: impl Fn(usize, usize) -> [f32; C],
-) {
-    let (side, step, full) = (window.output(), window.decimation, window.side as f32);
-    let (ratio_y, ratio_x) = (window.y.len as f32 / full, window.x.len as f32 / full);
-    let plane = side * side;
-    // Stripes: where a column reads is found once, and all of a stripe's numbers are at hand when
-    // they are normalised, several at a time.
-    let mut taps = [Tap { near: 0, far: 0, weight: 0.0 }; STRIPE];
-    for left in (0..side).step_by(STRIPE) {
-        let taps = &mut taps[..STRIPE.min(side - left)];
-        for (c, tap) in taps.iter_mut().enumerate() {
-            *tap = window.x.tap(left + c + window.margin, ratio_x, step);
-        }
-        for r in 0..side {
-            let v = window.y.tap(r + window.margin, ratio_y, step);
-            let mut values = [[0.0f32; STRIPE]; C];
-            for (c, h) in taps.iter().enumerate() {
-                let corners = [
-                    fetch(v.near, h.near),
-                    fetch(v.near, h.far),
-                    fetch(v.far, h.near),
-                    fetch(v.far, h.far),
-                ];
-                for (channel, values) in values.iter_mut().enumerate() {
-                    let [a, b, d, e] = corners.map(|p| p[channel]);
-                    let above = (1.0 - h.weight) * a + h.weight * b;
-                    let below = (1.0 - h.weight) * d + h.weight * e;
-                    values[c] = (1.0 - v.weight) * above + v.weight * below;
-                }
-            }
-            for channel in 0..3 {
-                let at = channel * plane + r * side + left;
-                // One channel stands for all three.
-                let values = &values[channel.min(C - 1)];
-                for (out, &value) in out[at..at + taps.len()].iter_mut().zip(values) {
-                    *out = norm(channel, value);
-                }
-            }
-        }
-    }
-}
-
-/// Columns that are sampled at a time.
-const STRIPE: usize = 64;
 
 #[cfg(test)]
 mod tests;

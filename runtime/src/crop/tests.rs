@@ -1,4 +1,5 @@
 use super::*;
+use crate::frame::PixelFormat;
 use crate::testing::{floats, golden_json, recipe};
 use proptest::prelude::*;
 use std::collections::BTreeMap;
@@ -218,7 +219,89 @@ fn senseless_positions_are_refused() {
     }
 }
 
+/// A pixel of a picture, read by itself.
+fn pixel(frame: &FrameView<'_>, y: usize, x: usize) -> [f32; 3] {
+    let at = |i: usize| f32::from(frame.data()[i]);
+    let line = y * frame.stride();
+    let yuv = |y: f32, u: f32, v: f32| {
+        let y = 1.164_383_6 * (y - 16.0);
+        let (u, v) = (u - 128.0, v - 128.0);
+        [y + 1.596_026_8 * v, y - 0.391_762_3 * u - 0.812_967_65 * v, y + 2.017_232_2 * u]
+            .map(|v| v.clamp(0.0, 255.0))
+    };
+    let pair = line + x / 2 * 4;
+    match frame.format() {
+        PixelFormat::Rgb8 => [0, 1, 2].map(|c| at(line + 3 * x + c)),
+        PixelFormat::Bgr8 => [2, 1, 0].map(|c| at(line + 3 * x + c)),
+        PixelFormat::Gray8 => [at(line + x); 3],
+        PixelFormat::Y16 { low, high } => {
+            let (low, high) = (f32::from(low), f32::from(high));
+            let raw = at(line + 2 * x) + 256.0 * at(line + 2 * x + 1);
+            [(raw.clamp(low, high) - low) * 255.0 / (high - low); 3]
+        }
+        PixelFormat::Yuyv => yuv(at(line + 2 * x), at(pair + 1), at(pair + 3)),
+        PixelFormat::Uyvy => yuv(at(line + 2 * x + 1), at(pair), at(pair + 2)),
+        PixelFormat::Nv12 => {
+            let chroma = (frame.height() + y / 2) * frame.stride() + x / 2 * 2;
+            yuv(at(line + x), at(chroma), at(chroma + 1))
+        }
+    }
+}
+
+/// A number of the output, computed by itself in double precision.
+fn single(frame: &FrameView<'_>, window: &Window, channel: usize, r: usize, c: usize) -> f64 {
+    let taps = |axis: &Axis, i: usize| {
+        let ratio = axis.len as f64 / window.side as f64;
+        let source = (ratio * ((i + window.margin) as f64 + 0.5) - 0.5).max(0.0);
+        let index = (source.floor() as i64).min(axis.len as i64 - 1);
+        let at = |i: i64| {
+            let inside = (axis.start + i.min(axis.len as i64 - 1)).clamp(0, axis.image as i64 - 1);
+            axis.offset + window.decimation * inside as usize
+        };
+        (at(index), at(index + 1), source - index as f64)
+    };
+    let ((top, bottom, v), (left, right, h)) = (taps(&window.y, r), taps(&window.x, c));
+    let at = |y, x| f64::from(pixel(frame, y, x)[channel]);
+    let across = |y| (1.0 - h) * at(y, left) + h * at(y, right);
+    (1.0 - v) * across(top) + v * across(bottom)
+}
+
 proptest! {
+    /// Rows that are kept and stripes of any width give what every pixel by itself gives.
+    #[test]
+    fn every_format_is_sampled_as_pixel_by_pixel(
+        (w, h) in (1usize..150, 1usize..60).prop_map(|(w, h)| (2 * w, 2 * h)),
+        format in prop_oneof![
+            Just(PixelFormat::Rgb8), Just(PixelFormat::Bgr8), Just(PixelFormat::Gray8),
+            Just(PixelFormat::Y16 { low: 9000, high: 60000 }), Just(PixelFormat::Yuyv),
+            Just(PixelFormat::Uyvy), Just(PixelFormat::Nv12),
+        ],
+        padding in 0usize..5,
+        output in prop_oneof![1usize..8, 40..200usize],
+        (y, x) in (-0.3f32..1.3, -0.3f32..1.3),
+        size in prop_oneof![1f32..60.0, 60f32..900.0],
+        replicate: bool,
+    ) {
+        let stride = format.row_bytes(w) + padding;
+        let data: Vec<u8> = (0..stride * 2 * h).map(|i| (i * i / 7 + i * 31) as u8).collect();
+        let frame = FrameView::new(&data, w, h, stride, format).unwrap();
+        let border =
+            if replicate { Border::Replicate } else { Border::InsideMajor { max_scale_change: 1.5 } };
+        let centre = Yx::new(y * h as f32, x * w as f32);
+        let window = Window::new(&frame, centre, size, output, border).unwrap();
+        let out = cut(&frame, &window);
+        for channel in 0..3 {
+            for r in 0..output {
+                for c in (0..output).step_by(1 + output / 20) {
+                    let got = f64::from(out[(channel * output + r) * output + c]);
+                    let want = single(&frame, &window, channel, r, c);
+                    // A coordinate's own rounding moves the weights.
+                    prop_assert!((got - want).abs() < 0.02, "{channel} {r} {c}: {got} {want}");
+                }
+            }
+        }
+    }
+
     /// Whatever is asked for, the sampler stays inside the buffer and returns picture values.
     #[test]
     fn any_crop_of_any_picture_is_computed(
