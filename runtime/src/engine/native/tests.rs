@@ -1,5 +1,6 @@
 //! Small graphs written by hand: what is computed, and what is refused.
 
+mod blocks;
 mod bytes;
 
 use super::*;

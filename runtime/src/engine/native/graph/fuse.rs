@@ -14,6 +14,8 @@ pub fn fuse(graph: &mut Graph<'_>) {
     sweep(graph);
     followers(graph);
     sweep(graph);
+    repeated(graph);
+    sweep(graph);
 }
 
 /// Index of the node that makes a value.
@@ -230,6 +232,45 @@ fn followers(graph: &mut Graph<'_>) {
             graph.nodes[at].inputs.truncate(1);
             at = next;
         }
+    }
+}
+
+/// A constant that is added to every block of a product's rows, cut into blocks for it, becomes the
+/// residual of the product: what positions add to the queries, keys and values of all templates.
+fn repeated(graph: &mut Graph<'_>) {
+    let uses = graph.uses();
+    let trace = Trace::new(graph);
+    let single = |id: ValueId| uses[id] == 1 && !graph.outputs.contains(&id);
+    let mut found = Vec::new();
+    for (i, node) in graph.nodes.iter().enumerate().filter(|(_, n)| n.op == Op::Binary(Binary::Add))
+    {
+        let sum = graph.shape(node.output);
+        let [.., width] = *sum else { continue };
+        for (x, added) in [(0, 1), (1, 0)].map(|(x, c)| (node.inputs[x], node.inputs[c])) {
+            let block = graph.shape(added);
+            // Whole dimensions, and before them nothing but ones.
+            let lead = block.iter().take_while(|&&n| n == 1).count();
+            let whole = sum.len() >= block.len() - lead && sum.ends_with(&block[lead..]);
+            let cut = trace.maker(x).filter(|n| n.op == Op::Reshape && single(x));
+            let Some(product) = cut.map(|n| n.inputs[0]).filter(|&id| single(id)) else { continue };
+            let Some(at) = trace.makers[product] else { continue };
+            let Op::MatMul { post } = &graph.nodes[at].op else { continue };
+            let free = post.residual.is_none() && !post.swish && post.clamp == UNLIMITED;
+            let matrix = graph.nodes[at].inputs[1];
+            let rows = graph.is_constant(matrix) && graph.shape(matrix).len() == 2;
+            let wide = graph.shape(product).last() == Some(&width) && block.len() > lead + 1;
+            if graph.is_constant(added) && graph.shape(x) == sum && whole && free && rows && wide {
+                found.push((i, at, product, added));
+                break;
+            }
+        }
+    }
+    for (i, at, product, added) in found {
+        if let Op::MatMul { post } = &mut graph.nodes[at].op {
+            post.residual = Some(added);
+        }
+        graph.nodes[i].op = Op::Reshape;
+        graph.nodes[i].inputs = vec![product];
     }
 }
 

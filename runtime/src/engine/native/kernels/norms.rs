@@ -59,38 +59,71 @@ pub struct LayerNorm {
     pub epsilon: f32,
 }
 
+/// Rows that are normalised side by side: their sums do not wait for each other.
+const ABREAST: usize = 4;
+
 /// # Safety
 /// The step was checked, the instruction set is there, nobody else touches the result.
 #[inline(always)]
 pub unsafe fn layer_norm<S: Simd>(s: &LayerNorm, mem: Mem, part: Part) {
+    let rows = part.of(s.size[0] * s.size[1]);
+    let mut row = rows.start;
+    // SAFETY: as the caller promises.
+    unsafe {
+        while row + ABREAST <= rows.end {
+            norm_rows::<S, ABREAST>(s, mem, row);
+            row += ABREAST;
+        }
+        for row in row..rows.end {
+            norm_rows::<S, 1>(s, mem, row);
+        }
+    }
+}
+
+/// # Safety
+/// As for [`layer_norm`]; there are `R` rows from `first` on.
+#[inline(always)]
+unsafe fn norm_rows<S: Simd, const R: usize>(s: &LayerNorm, mem: Mem, first: usize) {
     let n = s.columns;
     // SAFETY: rows and columns are those that were checked.
     unsafe {
         let gain = mem.weights.add(s.gain);
-        for row in part.of(s.size[0] * s.size[1]) {
-            let (y, x) = (row / s.size[1], row % s.size[1]);
-            let from = mem.at(s.input).add(y * s.input_pitch.y + x * s.input_pitch.x);
-            let to = mem.arena.add(s.output + y * s.output_pitch.y + x * s.output_pitch.x);
-            let mut sum = S::splat(0.0);
-            vectors::<S>(n, |at, lanes| sum = S::add(sum, load::<S>(from.add(at), lanes)));
-            let mean = S::sum(sum) / n as f32;
-            let (means, mean) = ([mean; 16], S::splat(mean));
-            let mut squares = S::splat(0.0);
-            vectors::<S>(n, |at, lanes| {
-                let d = deviation::<S>(from.add(at), lanes, mean, means.as_ptr());
-                squares = S::fma(d, d, squares);
-            });
-            let factor = S::splat(1.0 / (S::sum(squares) / n as f32 + s.epsilon).sqrt());
-            vectors::<S>(n, |at, lanes| {
-                let d = S::sub(load::<S>(from.add(at), lanes), mean);
-                let g = load::<S>(gain.add(at), lanes);
-                let o = match s.offset {
-                    Some(offset) => load::<S>(mem.weights.add(offset + at), lanes),
-                    None => S::splat(0.0),
-                };
-                store::<S>(to.add(at), S::fma(S::mul(d, factor), g, o), lanes);
-            });
-        }
+        let place: [(*const f32, *mut f32); R] = core::array::from_fn(|r| {
+            let (y, x) = ((first + r) / s.size[1], (first + r) % s.size[1]);
+            (
+                mem.at(s.input).add(y * s.input_pitch.y + x * s.input_pitch.x),
+                mem.arena.add(s.output + y * s.output_pitch.y + x * s.output_pitch.x),
+            )
+        });
+        let mut sums = [S::splat(0.0); R];
+        vectors::<S>(n, |at, lanes| {
+            for r in 0..R {
+                sums[r] = S::add(sums[r], load::<S>(place[r].0.add(at), lanes));
+            }
+        });
+        let means: [[f32; 16]; R] = core::array::from_fn(|r| [S::sum(sums[r]) / n as f32; 16]);
+        let mut squares = [S::splat(0.0); R];
+        vectors::<S>(n, |at, lanes| {
+            for r in 0..R {
+                let mean = S::splat(means[r][0]);
+                let d = deviation::<S>(place[r].0.add(at), lanes, mean, means[r].as_ptr());
+                squares[r] = S::fma(d, d, squares[r]);
+            }
+        });
+        let factors: [f32; R] =
+            core::array::from_fn(|r| 1.0 / (S::sum(squares[r]) / n as f32 + s.epsilon).sqrt());
+        vectors::<S>(n, |at, lanes| {
+            let g = load::<S>(gain.add(at), lanes);
+            let o = match s.offset {
+                Some(offset) => load::<S>(mem.weights.add(offset + at), lanes),
+                None => S::splat(0.0),
+            };
+            for r in 0..R {
+                let d = S::sub(load::<S>(place[r].0.add(at), lanes), S::splat(means[r][0]));
+                let v = S::fma(S::mul(d, S::splat(factors[r])), g, o);
+                store::<S>(place[r].1.add(at), v, lanes);
+            }
+        });
     }
 }
 

@@ -135,16 +135,18 @@ unsafe fn spread<S: Simd>(first: *const f32, row: usize, count: usize, lanes: us
             let p = first.add(i * row);
             if whole { S::load(p) } else { S::load_n(p, lanes) }
         };
+        // The number farthest from the mean is the largest or the smallest one.
         let mut sums = [S::splat(0.0); ABREAST];
+        let [mut top, mut bottom] = [load(0); 2];
         for i in 0..count {
-            sums[i % ABREAST] = S::add(sums[i % ABREAST], load(i));
+            let v = load(i);
+            sums[i % ABREAST] = S::add(sums[i % ABREAST], v);
+            top = S::at_least(top, v);
+            bottom = S::at_most(bottom, v);
         }
         let sum = S::add(S::add(sums[0], sums[1]), S::add(sums[2], sums[3]));
         let mean = S::mul(sum, S::splat(1.0 / count as f32));
-        let mut most = S::splat(0.0);
-        for i in 0..count {
-            most = S::at_least(most, magnitude::<S>(S::sub(load(i), mean)));
-        }
+        let most = S::at_least(S::sub(top, mean), S::sub(mean, bottom));
         [mean, most]
     }
 }
@@ -170,6 +172,9 @@ pub unsafe fn pack<D: Dot>(s: &PackKvBytes, mem: Mem, part: Part) {
     }
 }
 
+/// Vectors of a key whose means are kept between two walks over all keys.
+const KEPT: usize = 8;
+
 /// Columns of the products of queries and keys are keys: the four bytes of a group lie together.
 #[inline(always)]
 unsafe fn pack_keys<D: Dot>(s: &PackKvBytes, keys: *const f32, out: *mut f32) {
@@ -182,16 +187,24 @@ unsafe fn pack_keys<D: Dot>(s: &PackKvBytes, keys: *const f32, out: *mut f32) {
             *starts.add(j) = if j < count { 0 } else { NEVER };
         }
         let mut most = 0.0f32;
-        for at in (0..key).step_by(lanes) {
-            let [_, far] = spread::<D::F>(keys.add(at), s.key_row, count, lanes.min(key - at));
+        let mut means = [D::F::splat(0.0); KEPT];
+        for (i, at) in (0..key).step_by(lanes).enumerate() {
+            let n = lanes.min(key - at);
+            let [mean, far] = spread::<D::F>(keys.add(at), s.key_row, count, n);
             most = most.max(D::F::top(far));
+            if let Some(kept) = means.get_mut(i) {
+                *kept = mean;
+            }
         }
         *out.add(p.key_step) = most / MOST;
         let factor = D::F::splat(inverse(most));
         let width = MAX_VECTORS * lanes;
-        for at in (0..key).step_by(lanes) {
+        for (i, at) in (0..key).step_by(lanes).enumerate() {
             let n = lanes.min(key - at);
-            let [mean, _] = spread::<D::F>(keys.add(at), s.key_row, count, n);
+            let mean = match means.get(i) {
+                Some(&mean) => mean,
+                None => spread::<D::F>(keys.add(at), s.key_row, count, n)[0],
+            };
             let (first, groups) = (at / BYTES, Eight::floats(n));
             for j in 0..p.keys {
                 let words = if j < count {
@@ -292,20 +305,14 @@ unsafe fn pack_values<D: Dot>(s: &PackKvBytes, values: *const f32, out: *mut f32
                         *row = rounded::<D>(values.add(j * s.value_row + at), n, mean, factor);
                     }
                 }
-                let rows = rows.map(bytes_of);
+                let [a, b, c, d] = rows.map(bytes_of);
                 let mut words = [0u32; MAX_BYTES];
                 for (lane, word) in words.iter_mut().enumerate() {
-                    *word = u32::from_ne_bytes([
-                        rows[0][lane],
-                        rows[1][lane],
-                        rows[2][lane],
-                        rows[3][lane],
-                    ]);
+                    // Written with shifts, this becomes vector code.
+                    let low = u32::from(a[lane]) | u32::from(b[lane]) << 8;
+                    *word = u32::from_le(low | u32::from(c[lane]) << 16 | u32::from(d[lane]) << 24);
                 }
-                let vector = to.add(group * columns);
-                for (lane, word) in words.into_iter().enumerate().take(lanes) {
-                    put::<D>(vector, lane, word);
-                }
+                put_all::<D>(to.add(group * columns), &words);
             }
             let starts = out.add(p.value_starts + at).cast::<i32>();
             for lane in 0..lanes {
@@ -342,6 +349,21 @@ unsafe fn put<D: Dot>(p: *mut f32, lane: usize, four: u32) {
         }
         for (row, byte) in four.to_ne_bytes().into_iter().enumerate() {
             *p.cast::<u8>().add(D::LAYOUT.at(D::F::LANES, lane, row)) = byte;
+        }
+    }
+}
+
+/// Four rows of as many columns as there are lanes.
+#[inline(always)]
+unsafe fn put_all<D: Dot>(p: *mut f32, words: &[u32; MAX_BYTES]) {
+    // SAFETY: the caller promises a whole vector.
+    unsafe {
+        if D::LAYOUT == Layout::Quads {
+            D::F::store(p, D::F::load(words.as_ptr().cast()));
+            return;
+        }
+        for (lane, &word) in words.iter().enumerate().take(D::F::LANES) {
+            put::<D>(p, lane, word);
         }
     }
 }

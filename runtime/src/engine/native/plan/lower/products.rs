@@ -202,8 +202,29 @@ impl Lower<'_, '_, '_> {
             }
             None => None,
         };
+        // One for every block of rows: the same rows, written as lines of a block each.
+        let mut lines = to.clone();
+        if let Some(r) = &mut residual
+            && r.shape != shape
+        {
+            let block = r.shape.iter().product::<usize>() / columns;
+            let blocks = shape.iter().product::<usize>() / columns / block;
+            let cut = |v: &View| {
+                let width = v.shape.last().copied().unwrap_or(1);
+                v.reshaped(&[blocks, block, width]).ok_or(TOO_MANY)
+            };
+            *r = r
+                .reshaped(&[1, block, columns])
+                .ok_or(TOO_MANY)?
+                .expanded(&[blocks, block, columns]);
+            lines = cut(&lines)?;
+            a = match cut(&a) {
+                Ok(a) => a,
+                Err(_) => cut(&self.whole(&a)?)?,
+            };
+        }
         let views = |a: &View, r: &Option<View>| -> Vec<View> {
-            [Some(a), Some(&to), r.as_ref()].into_iter().flatten().cloned().collect()
+            [Some(a), Some(&lines), r.as_ref()].into_iter().flatten().cloned().collect()
         };
         let joined = |a: &View, r: &Option<View>| {
             let all = views(a, r);
