@@ -216,7 +216,8 @@ impl Window {
 pub struct Post {
     /// One number per output channel; a constant.
     pub bias: Option<ValueId>,
-    /// A tensor of the product's shape.
+    /// A tensor of the product's shape; after a matrix product also a constant for each block of its
+    /// rows.
     pub residual: Option<ValueId>,
     /// Whether the result is the hard-swish of the sum.
     pub swish: bool,
