@@ -30,11 +30,9 @@ pub use session::GraphSession;
 
 const NAME: &str = "native";
 
-/// Floats by which so many weights may grow where that saves time: a ninth, 2 MiB at least.
-const fn spare(weights: usize) -> usize {
-    let (share, least) = (weights / 9, 512 * 1024);
-    if share > least { share } else { least }
-}
+/// Floats by which weights may grow where that saves time. Those that would go beyond are transformed
+/// in every run: reading them in their larger form from memory takes no less.
+const GROWTH: usize = 512 * 1024;
 
 /// How to run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,8 +45,8 @@ pub struct NativeOptions {
     pub isa: Option<Isa>,
     /// Whether attention stays in floats where the products around it are of bytes.
     pub float_attention: bool,
-    /// Whether 3 x 3 convolutions over floats stay what they are. Otherwise those whose transformed
-    /// weights fit into a ninth more memory are computed with 16 multiplications in the place of 36.
+    /// Whether 3 x 3 convolutions over floats stay what they are. Otherwise those of every pixel are
+    /// computed with 16 multiplications in the place of 36 where that is less work in all.
     pub direct_convolution: bool,
 }
 
@@ -200,9 +198,9 @@ impl NativeEngine {
         let spec = bundle.manifest().spec;
         let graphs = Graphs::read(bundle, spec.templates)?;
         let weights = bundle.section(SectionKind::Weights).unwrap_or_default().len() / 4;
-        let spare = if options.direct_convolution { 0 } else { spare(weights) };
+        let growth = (!options.direct_convolution).then_some(GROWTH);
         let mut planner =
-            Planner::new(kernels, threads, weights + weights / 16, spare, bundle.mapping());
+            Planner::new(kernels, threads, weights + weights / 16, growth, bundle.mapping());
         if !options.float_attention {
             planner.narrow_attention();
         }

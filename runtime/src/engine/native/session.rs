@@ -39,7 +39,7 @@ impl GraphSession {
             return Err(failed(&format_args!("this processor has no {}", isa.name())));
         };
         let size = (onnx.len() + weights.len()) / 4;
-        let mut planner = Planner::new(kernels, 1, size, super::spare(size), None);
+        let mut planner = Planner::new(kernels, 1, size, Some(super::GROWTH), None);
         let mut place = |ids: &[usize]| -> Vec<(String, Range<usize>, View)> {
             ids.iter()
                 .map(|&id| {

@@ -2,6 +2,7 @@
 
 mod blocks;
 mod bytes;
+mod points;
 
 use super::*;
 use crate::bundle::{
@@ -311,7 +312,7 @@ fn what_is_wrong_with_a_bundle_is_named() {
 
 /// Runs one graph `x -> y` on the planner and a team of two threads.
 fn evaluate(bytes: &[u8], x: (&[usize], &[f32]), y: &[usize]) -> Vec<f32> {
-    planned(bytes, x, y, 0).0
+    planned(bytes, x, y, None).0
 }
 
 /// As [`evaluate`], with so many floats for transformed weights; also how often every kind of step
@@ -320,12 +321,12 @@ fn planned(
     bytes: &[u8],
     x: (&[usize], &[f32]),
     y: &[usize],
-    spare: usize,
+    growth: Option<usize>,
 ) -> (Vec<f32>, Vec<(&'static str, usize)>) {
     let mut graph = graph::read(bytes, &[]).unwrap();
     graph::fuse(&mut graph);
     let kernels = Isa::best().kernels().unwrap();
-    let mut planner = Planner::new(kernels, 2, 0, spare, None);
+    let mut planner = Planner::new(kernels, 2, 0, growth, None);
     let (from, to) = (planner.lasting(x.1.len()), planner.lasting(y.iter().product()));
     let bind =
         |name, at, shape: &[usize]| Binding { name, view: View::dense(Base::Arena(at), shape) };
@@ -515,51 +516,6 @@ fn unusual_convolutions() {
             }
         }
         assert!((v - sum.max(0.0)).abs() < 1e-5, "{v} instead of {sum} at {i}");
-    }
-}
-
-/// Two convolutions with a border between them and a residual, by loops and by points: in several
-/// blocks, and only as far as weights may grow.
-#[test]
-fn convolutions_by_points() {
-    let numbers = |n: usize, seed: usize| -> Vec<f32> {
-        (0..n).map(|i| ((i * 7919 + seed * 104_729) % 2003) as f32 / 1001.0 - 1.0).collect()
-    };
-    let (c, shape) = (32, [1, 32, 36, 40]);
-    let conv = |from: &str, w: &str, b: &str, to: &str| {
-        node("Conv", &[from, w, b], to, vec![ints("pads", &[1; 4])])
-    };
-    let file = model(
-        vec![
-            conv("x", "v", "a", "c"),
-            node("Relu", &["c"], "h", vec![]),
-            conv("h", "w", "b", "d"),
-            node("Add", &["d", "h"], "s", vec![]),
-            node("Relu", &["s"], "y", vec![]),
-        ],
-        vec![port("x", &shape)],
-        vec![port("y", &shape)],
-        vec![
-            floats("v", &[c, c, 3, 3], &numbers(9 * c * c, 1)),
-            floats("w", &[c, c, 3, 3], &numbers(9 * c * c, 2)),
-            floats("a", &[c], &numbers(c, 3)),
-            floats("b", &[c], &numbers(c, 4)),
-        ],
-    );
-    let x = numbers(shape.iter().product(), 5);
-    let grown = 7 * c * c;
-    let (direct, kinds) = planned(&file, (&shape, &x), &shape, grown - 1);
-    assert!(kinds.contains(&("convolution", 2)), "{kinds:?}");
-    let largest = direct.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-    for (spare, convolutions) in [(grown, 1), (2 * grown, 0)] {
-        let (found, kinds) = planned(&file, (&shape, &x), &shape, spare);
-        let count = |kind: &str| kinds.iter().find(|k| k.0 == kind).map_or(0, |k| k.1);
-        assert_eq!(count("convolution"), convolutions, "{kinds:?}");
-        assert!(count("to points") >= 2 * (2 - convolutions), "{kinds:?}");
-        assert_eq!(count("to points"), count("from points"));
-        for (i, (a, b)) in found.iter().zip(&direct).enumerate() {
-            assert!((a - b).abs() <= 1e-6 * largest, "{a} instead of {b} at {i}");
-        }
     }
 }
 

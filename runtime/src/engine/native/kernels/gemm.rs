@@ -26,7 +26,7 @@ pub struct Gemm {
     /// Elements per tap.
     pub run: usize,
     /// Packed weights: [`Packing`] of `taps * run` rows.
-    pub weights: usize,
+    pub weights: Place,
     /// Bias, padded with zeros to the packed width.
     pub bias: Option<usize>,
     /// Columns of the result.
@@ -443,7 +443,7 @@ impl Gemm {
         let vectors = tile.columns.div_ceil(k.packing.lanes);
         // SAFETY: the panel is inside the packed weights, and the tile is as the kernel wants it.
         unsafe {
-            tile.b = mem.weights.add(self.weights + tile.column * self.depth());
+            tile.b = mem.at(self.weights).add(tile.column * self.depth());
             (k.of[vectors - 1][rows - 1])(tile);
         }
     }

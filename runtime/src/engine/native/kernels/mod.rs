@@ -45,7 +45,7 @@ pub use program::Program;
 pub use step::Step;
 pub use table::{Isa, Kernels};
 pub use team::Team;
-pub use winograd::{FromPoints, Matrices, POINTS, ToPoints, transform};
+pub use winograd::{FromPoints, KernelsToPoints, Matrices, POINTS, ToPoints, transform};
 
 /// Where a tensor starts, in floats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

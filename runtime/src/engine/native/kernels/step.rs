@@ -2,7 +2,7 @@
 
 use super::attention::Attention;
 use super::eight::BYTES;
-use super::winograd::{FromPoints, ToPoints};
+use super::winograd::{FromPoints, KernelsToPoints, POINTS, ToPoints};
 use super::{
     Copy, Depthwise, Eight, Fold, Gemm, Halo, Kernels, LayerNorm, Map, MapNorm, MatMul, Mem,
     PackKv, PackKvBytes, Part, Pitch, Place, Pool, Quantise, Softmax, ThinAttention, Zip,
@@ -17,6 +17,8 @@ pub enum Step {
     Gemm(Gemm),
     /// Windows of 4 x 4 to points, for products in the place of a 3 x 3 convolution.
     ToPoints(ToPoints),
+    /// Kernels of 3 x 3 to points, as weights of these products.
+    KernelsToPoints(KernelsToPoints),
     /// Points to pixels, after these products.
     FromPoints(FromPoints),
     /// Floats to bytes.
@@ -134,6 +136,7 @@ impl Step {
                 (false, true) => "linear of bytes",
             },
             Self::ToPoints(_) => "to points",
+            Self::KernelsToPoints(_) => "kernels to points",
             Self::FromPoints(_) => "from points",
             Self::Quantise(_) => "to bytes",
             Self::Depthwise(_) => "depthwise",
@@ -163,6 +166,7 @@ impl Step {
                 2 * s.rows() * s.columns * s.depth() * numbers
             }
             Self::ToPoints(s) => 32 * s.size[0] * s.size[1] * s.channels,
+            Self::KernelsToPoints(s) => 36 * s.channels * s.columns,
             Self::FromPoints(s) => 32 * s.size[0] * s.size[1] * s.columns,
             Self::Quantise(s) => 4 * s.size[0] * s.size[1] * s.channels,
             Self::Depthwise(s) => 2 * s.size[0] * s.size[1] * s.channels * s.taps.len(),
@@ -214,12 +218,14 @@ impl Step {
             Self::Clear(halo) => at(&mut halo.start),
             Self::Gemm(s) => {
                 place(&mut s.input);
+                place(&mut s.weights);
                 if let Some((from, _)) = &mut s.residual {
                     place(from);
                 }
                 at(&mut s.output);
                 border(&mut s.halo);
             }
+            Self::KernelsToPoints(s) => at(&mut s.output),
             Self::ToPoints(s) => {
                 place(&mut s.input);
                 at(&mut s.output.start);
@@ -312,7 +318,7 @@ impl Step {
                 let reach = s.taps.iter().copied().max().unwrap_or(0) + s.run;
                 spans.read(s.input, extent(s.size, s.input_pitch, reach));
                 let packing = s.packing(k);
-                spans.weights(Some(s.weights), packing.len(s.depth(), s.columns));
+                spans.read(s.weights, packing.len(s.depth(), s.columns));
                 spans.weights(s.bias, packing.columns(s.columns));
                 spans.weights(s.scales, packing.columns(s.columns));
                 let biased = s.scales.is_none() || s.bias.is_some();
@@ -329,6 +335,11 @@ impl Step {
                 let tiles = s.size[0] * s.size[1];
                 spans.write(s.output.start, s.output.extent(tiles, s.channels));
                 spans.demand(s.output.apart(tiles, s.channels), "its points overlap");
+            }
+            Self::KernelsToPoints(s) => {
+                let len = k.packing.len(s.channels, s.columns);
+                spans.weights(Some(s.weights), 9 * len);
+                spans.write(s.output, POINTS * len);
             }
             Self::FromPoints(s) => {
                 let (tiles, pixels) = (s.size[0] * s.size[1], s.size.map(|n| 2 * n));
@@ -473,6 +484,7 @@ impl Step {
                 }
                 Self::Gemm(s) => s.run(k, mem, part),
                 Self::ToPoints(s) => (k.to_points)(s, mem, part),
+                Self::KernelsToPoints(s) => (k.kernels_to_points)(s, k.packing, mem, part),
                 Self::FromPoints(s) => (k.from_points)(s, mem, part),
                 Self::Quantise(s) => (k.eight.quantise)(s, mem, part),
                 Self::Depthwise(s) => (k.depthwise)(s, mem, part),

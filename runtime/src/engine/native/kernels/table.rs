@@ -8,7 +8,7 @@ use super::loops::{self, Copy, Fold, Map, Zip};
 use super::matmul::{self, MatMul};
 use super::norms::{self, LayerNorm, MapNorm, Softmax};
 use super::simd::{Scalar, Simd};
-use super::winograd::{self, FromPoints, ToPoints};
+use super::winograd::{self, FromPoints, KernelsToPoints, ToPoints};
 use super::{Mem, Part};
 
 /// Most rows of a tile.
@@ -94,6 +94,7 @@ pub struct Kernels {
     pub(super) depthwise: unsafe fn(&Depthwise, Mem, Part),
     pub(super) pool: unsafe fn(&Pool, Mem, Part),
     pub(super) to_points: unsafe fn(&ToPoints, Mem, Part),
+    pub(super) kernels_to_points: unsafe fn(&KernelsToPoints, Packing, Mem, Part),
     pub(super) from_points: unsafe fn(&FromPoints, Mem, Part),
     pub(super) layer_norm: unsafe fn(&LayerNorm, Mem, Part),
     pub(super) softmax: unsafe fn(&Softmax, Mem, Part),
@@ -130,6 +131,8 @@ macro_rules! table {
                 depthwise(s: &Depthwise, m: Mem, p: Part) => conv::depthwise::<$set>(s, m, p);
                 pool(s: &Pool, m: Mem, p: Part) => conv::pool::<$set>(s, m, p);
                 to_points(s: &ToPoints, m: Mem, p: Part) => winograd::to_points::<$set>(s, m, p);
+                kernels_to_points(s: &KernelsToPoints, packing: Packing, m: Mem, p: Part)
+                    => winograd::kernels_to_points::<$set>(s, packing, m, p);
                 from_points(s: &FromPoints, m: Mem, p: Part)
                     => winograd::from_points::<$set>(s, m, p);
                 layer_norm(s: &LayerNorm, m: Mem, p: Part) => norms::layer_norm::<$set>(s, m, p);
@@ -160,6 +163,7 @@ macro_rules! table {
                 depthwise,
                 pool,
                 to_points,
+                kernels_to_points,
                 from_points,
                 layer_norm,
                 softmax,

@@ -144,7 +144,7 @@ proptest! {
                 input_pitch: Pitch { y: stride * line, x: stride * pixel },
                 taps,
                 run: c,
-                weights: 5,
+                weights: Place::Weights(5),
                 bias: (with & 1 == 1).then_some(at),
                 columns: n,
                 output,

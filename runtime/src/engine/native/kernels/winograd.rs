@@ -6,6 +6,7 @@
 //! with weights transformed at load ([`transform`], `GgG'`) follow; [`FromPoints`] turns their results
 //! into pixels (`A'mA`). The transforms of pixels are additions only, so little precision is lost.
 
+use super::gemm::Packing;
 use super::simd::{Simd, hard_swish};
 use super::{Mem, Part, Pitch, Place};
 
@@ -50,6 +51,19 @@ pub struct ToPoints {
     pub output: Matrices,
 }
 
+/// Packed weights of a 3 x 3 convolution to packed weights of the products, point by point.
+#[derive(Clone, Debug)]
+pub struct KernelsToPoints {
+    /// Rows of each of the nine matrices that lie one after the other, and of the results.
+    pub channels: usize,
+    /// Their columns.
+    pub columns: usize,
+    /// [`Packing`] of `9 * channels` rows, pixel by pixel of the kernel.
+    pub weights: usize,
+    /// [`POINTS`] packings of `channels` rows.
+    pub output: usize,
+}
+
 /// Points to pixels of the result, `clamp(sum + bias + residual)` as for [`super::Gemm`].
 #[derive(Clone, Debug)]
 pub struct FromPoints {
@@ -86,6 +100,53 @@ pub fn transform(g: [[f32; 3]; 3]) -> [f32; POINTS] {
         }
     }
     out
+}
+
+/// Three numbers of a kernel in a row to points (`Gg`).
+#[inline(always)]
+unsafe fn kernel<S: Simd>([a, b, c]: [S::V; 3]) -> [S::V; 4] {
+    // SAFETY: the caller promises the instruction set.
+    unsafe {
+        let half = S::splat(0.5);
+        let (ends, middle) = (S::mul(half, S::add(a, c)), S::mul(half, b));
+        [a, S::add(ends, middle), S::sub(ends, middle), c]
+    }
+}
+
+/// # Safety
+/// The step was checked, the instruction set and its packing are there, nobody else touches the result.
+#[inline(always)]
+pub unsafe fn kernels_to_points<S: Simd>(
+    s: &KernelsToPoints,
+    packing: Packing,
+    mem: Mem,
+    part: Part,
+) {
+    let len = packing.len(s.channels, s.columns);
+    // SAFETY: the check covers nine matrices and as many results as there are points.
+    unsafe {
+        // Panels lie one after the other; rows of all of them are shared out.
+        for row in part.of(s.columns.div_ceil(packing.width) * s.channels) {
+            let (panel, channel) = (row / s.channels, row % s.channels);
+            let first = panel * packing.width;
+            let width = packing.columns(packing.width.min(s.columns - first));
+            let from = mem.weights.add(s.weights + 9 * first * s.channels + channel * width);
+            let to = mem.arena.add(s.output + first * s.channels + channel * width);
+            for column in (0..width).step_by(S::LANES) {
+                let load = |tap: usize| S::load(from.add(tap * s.channels * width + column));
+                let mut lines = [[S::splat(0.0); 4]; 3];
+                for y in 0..3 {
+                    lines[y] = kernel::<S>([load(3 * y), load(3 * y + 1), load(3 * y + 2)]);
+                }
+                for x in 0..4 {
+                    let points = kernel::<S>([lines[0][x], lines[1][x], lines[2][x]]);
+                    for y in 0..4 {
+                        S::store(to.add((4 * y + x) * len + column), points[y]);
+                    }
+                }
+            }
+        }
+    }
 }
 
 /// Four pixels in a row to points (`B'd`).

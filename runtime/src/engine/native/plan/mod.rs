@@ -133,8 +133,9 @@ pub struct Planner {
     mapping: Option<Arc<Mapping>>,
     made: HashMap<Made, usize>,
     lasting: usize,
-    /// Floats by which transformed weights may still grow.
-    spare: usize,
+    /// Floats by which weights may still grow when those of 3 x 3 convolutions are transformed; the
+    /// others are transformed in every run. Without it these convolutions stay what they are.
+    growth: Option<usize>,
     /// Whether attention in graphs with products of bytes is computed in bytes too.
     byte_attention: bool,
     /// Computed once, from constants only.
@@ -146,16 +147,17 @@ pub struct Planner {
 
 impl Planner {
     /// For an instruction set and a number of threads. `weights` is about how many floats there
-    /// will be, `spare` by how many more they may grow where that saves time; `mapping` the file they
+    /// will be, `growth` by how many more they may grow for 3 x 3 convolutions
+    /// by points, without which there are none; `mapping` the file they
     /// come from, which gets its memory back piece by piece.
     pub fn new(
         kernels: &'static Kernels,
         threads: usize,
         weights: usize,
-        spare: usize,
+        growth: Option<usize>,
         mapping: Option<Arc<Mapping>>,
     ) -> Self {
-        let mut weights: Vec<f32> = Vec::with_capacity(weights + spare + ALIGN);
+        let mut weights: Vec<f32> = Vec::with_capacity(weights + growth.unwrap_or(0) + ALIGN);
         // Where that cannot be said, it is all the same: kernels work with any alignment.
         let origin = Some(weights.as_ptr().align_offset(4 * ALIGN)).filter(|&n| n < ALIGN);
         weights.resize(origin.unwrap_or(0), 0.0);
@@ -167,7 +169,7 @@ impl Planner {
             mapping,
             made: HashMap::new(),
             lasting: 0,
-            spare,
+            growth,
             byte_attention: false,
             once: Default::default(),
             once_buffers: Vec::new(),

@@ -87,7 +87,7 @@ proptest! {
                 input_pitch: Pitch { y: stride * line, x: stride * pixel },
                 taps: (0..area).map(|t| t / kernel * line + t % kernel * pixel).collect(),
                 run: groups,
-                weights: 5,
+                weights: Place::Weights(5),
                 bias: Some(bias_at),
                 columns: n,
                 output,

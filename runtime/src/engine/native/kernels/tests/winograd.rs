@@ -25,6 +25,7 @@ proptest! {
         (lines, across) in (1usize..miri(3, 5), 1usize..miri(3, 6)),
         (c, n) in (1usize..miri(6, 40), 1usize..miri(19, 50)),
         (gap, with, swish, threads) in (0usize..5, 0usize..4, any::<bool>(), 1usize..4),
+        fresh in any::<bool>(),
     ) {
         let (h, w) = (2 * lines, 2 * across);
         let (pixel, line) = (c + gap, (w + 2) * (c + gap) + 1);
@@ -45,7 +46,9 @@ proptest! {
         let residual_at = input.len();
         let before = matrices(residual_at + residual.len(), c);
         let after = matrices(before.start + POINTS * before.matrix + c, n);
-        let output = after.start + POINTS * after.matrix + n;
+        let fresh_at = after.start + POINTS * after.matrix + n;
+        // Room for every packing.
+        let output = fresh_at + POINTS * c * n.next_multiple_of(16);
         let (out_pixel, out_line) = (n + gap, w * (n + gap) + gap);
         for (isa, k) in tables() {
             let mut weights = vec![0.0; 5];
@@ -57,16 +60,32 @@ proptest! {
                 };
                 k.packing.pack(c, n, row, &mut weights);
             }
+            // The same, as the convolution itself would read them.
+            let plain_at = weights.len();
+            let row = |at: usize, out: &mut [f32]| {
+                for (j, v) in out.iter_mut().enumerate() {
+                    *v = kernels[j * c + at % c][at / c / 3][at / c % 3];
+                }
+            };
+            k.packing.pack(9 * c, n, row, &mut weights);
             let bias_at = weights.len();
             weights.extend(&bias);
             weights.resize(bias_at + k.packing.columns(n), 0.0);
-            let mut steps = vec![Step::ToPoints(ToPoints {
+            let made = if fresh { Place::Arena(fresh_at) } else { Place::Weights(5) };
+            let transformed = Step::KernelsToPoints(KernelsToPoints {
+                channels: c,
+                columns: n,
+                weights: plain_at,
+                output: fresh_at,
+            });
+            let mut steps: Vec<_> = fresh.then_some(transformed).into_iter().collect();
+            steps.push(Step::ToPoints(ToPoints {
                 size: [lines, across],
                 channels: c,
                 input: Place::Arena(3),
                 input_pitch: Pitch { y: line, x: pixel },
                 output: before,
-            })];
+            }));
             steps.extend((0..POINTS).map(|p| {
                 Step::Gemm(Gemm {
                     size: [1, tiles],
@@ -74,7 +93,7 @@ proptest! {
                     input_pitch: Pitch { y: 0, x: before.row },
                     taps: [0].into(),
                     run: c,
-                    weights: 5 + p * k.packing.len(c, n),
+                    weights: made.beyond(p * k.packing.len(c, n)),
                     bias: None,
                     columns: n,
                     output: after.start + p * after.matrix,

@@ -126,7 +126,7 @@ impl Lower<'_, '_, '_> {
                 input_pitch: stride,
                 taps: taps.clone(),
                 run,
-                weights,
+                weights: Place::Weights(weights),
                 bias,
                 scales,
                 columns,
@@ -144,7 +144,7 @@ impl Lower<'_, '_, '_> {
 
     /// Packs output channels `first .. first + count` of a convolution's weights `(N, C, h, w)` as a
     /// matrix with rows `(h, w, C)`.
-    fn pack_kernel(&mut self, id: usize, first: usize, count: usize) -> Try<usize> {
+    pub(super) fn pack_kernel(&mut self, id: usize, first: usize, count: usize) -> Try<usize> {
         let [_, channels, kh, kw] = four(self.graph.shape(id))?;
         let (data, from) = self.constant(id)?;
         let area = kh * kw;
@@ -241,7 +241,7 @@ impl Lower<'_, '_, '_> {
             None => None,
         };
         self.gemm(&a, rows.size, (rows.pitch[0], rows.pitch[1]), depth, &to, |gemm| Gemm {
-            weights,
+            weights: Place::Weights(weights),
             bias,
             scales,
             columns,
@@ -270,7 +270,7 @@ impl Lower<'_, '_, '_> {
             input_pitch: pitch.0,
             taps: [0].into(),
             run: depth,
-            weights: 0,
+            weights: Place::Weights(0),
             bias: None,
             columns: 0,
             output: address(to)?,
@@ -311,7 +311,7 @@ impl Lower<'_, '_, '_> {
             let (size, pitches) = ([1, a.shape[0]], (pitch(&a), pitch(&to)));
             let columns = b.shape[1];
             self.gemm(&a, size, pitches, b.shape[0], &to, |gemm| Gemm {
-                weights,
+                weights: Place::Weights(weights),
                 columns,
                 ..gemm
             })?;

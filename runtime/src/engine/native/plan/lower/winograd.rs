@@ -3,7 +3,7 @@
 
 use super::super::super::graph::{Post, Window};
 use super::super::super::kernels::{
-    FromPoints, Gemm, Matrices, POINTS, Pitch, Place, Step, ToPoints, transform,
+    FromPoints, Gemm, KernelsToPoints, Matrices, POINTS, Pitch, Place, Step, ToPoints, transform,
 };
 use super::super::view::{Base, View};
 use super::super::{ALIGN, Made, source, spread};
@@ -18,38 +18,58 @@ const ROWS: usize = 3;
 const BLOCK: usize = 256 * 1024;
 /// Full tiles of rows in a block, at least: weights are read once per block.
 const BLOCK_ROWS: usize = 8;
+/// Fewest full tiles of rows where weights are transformed in every run: below that it takes longer than
+/// the products save.
+const FRESH_ROWS: usize = 5;
+/// Floats of such weights that are made and used at a time, beside the points.
+const FRESH: usize = 512 * 1024;
+
+/// Weights for products of points.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Points {
+    /// Transformed at load.
+    Made(usize),
+    /// To be transformed in every run, from what the convolution itself would read.
+    Fresh(usize),
+}
 
 impl Lower<'_, '_, '_> {
-    /// The transformed weights of a convolution of one group over floats, if it is one for this way:
-    /// 3 x 3, every pixel, one pixel of border, a result of even size.
+    /// The weights of a convolution of one group over floats, if it is one for this way: 3 x 3, every
+    /// pixel, one pixel of border, a result of even size. They are transformed at load as long as
+    /// weights may grow.
     pub(super) fn points(
         &mut self,
         id: usize,
         window: &Window,
         size: [usize; 2],
-    ) -> Try<Option<usize>> {
+    ) -> Try<Option<Points>> {
         let [n, channels, kh, kw] = four(self.graph.shape(id))?;
+        let tiles = size[0] * size[1] / 4;
         let fits = [kh, kw] == [3, 3]
             && window.stride == [1, 1]
             && window.dilation == [1, 1]
             && window.pad == [1, 1, 1, 1]
             && size.iter().all(|n| n.is_multiple_of(2))
-            && size[0] * size[1] / 4 >= ROWS * self.planner.kernels.rows
+            && tiles >= ROWS * self.planner.kernels.rows
             && channels.min(n) >= CHANNELS;
-        if !fits || self.once {
+        let Some(growth) = self.planner.growth.filter(|_| fits && !self.once) else {
             return Ok(None);
-        }
+        };
         let data = self.graph.values[id].data.as_ref().ok_or("an operand is not constant")?;
         let made = Made::Points(source(self.index, id, data));
         if let Some(&at) = self.planner.made.get(&made) {
-            return Ok(Some(at));
+            return Ok(Some(Points::Made(at)));
         }
         let grown = (POINTS - 9) * channels * n;
-        let Some(left) = self.planner.spare.checked_sub(grown) else { return Ok(None) };
-        self.planner.spare = left;
+        let Some(left) = growth.checked_sub(grown) else {
+            let worth = tiles >= FRESH_ROWS * self.planner.kernels.rows;
+            let fresh = worth.then(|| self.pack_kernel(id, 0, n)).transpose()?;
+            return Ok(fresh.map(Points::Fresh));
+        };
+        self.planner.growth = Some(left);
         let (data, _) = self.constant(id)?;
         let packing = self.planner.kernels.packing;
-        Ok(Some(self.planner.make(made, || {
+        Ok(Some(Points::Made(self.planner.make(made, || {
             let mut points = vec![0.0; POINTS * channels * n];
             for (at, kernel) in data.chunks_exact(9).enumerate() {
                 let (column, channel) = (at / channels, at % channels);
@@ -64,13 +84,13 @@ impl Lower<'_, '_, '_> {
                 packing.pack(channels, n, row, &mut packed);
             }
             packed
-        })))
+        }))))
     }
 
     /// The convolution with those weights, block by block of lines of the result.
     pub(super) fn winograd(
         &mut self,
-        weights: usize,
+        weights: Points,
         [channels, columns]: [usize; 2],
         source: &MapSource,
         target: &MapTarget,
@@ -102,6 +122,18 @@ impl Lower<'_, '_, '_> {
             self.push(Step::Clear(border));
         }
         let packing = self.planner.kernels.packing;
+        // Where all columns of fresh weights are not needed again for the next block, a few at a time do.
+        let group = match weights {
+            Points::Fresh(_) if blocks == 1 => {
+                let panels = FRESH / (POINTS * channels * packing.width);
+                (panels.max(1) * packing.width).min(columns)
+            }
+            _ => columns,
+        };
+        let fresh = match weights {
+            Points::Fresh(_) => Some(self.buffer(POINTS * packing.len(channels, group))),
+            Points::Made(_) => None,
+        };
         let pitches = (Pitch { y: 0, x: row_in }, Pitch { y: 0, x: row_out });
         for first in (0..all).step_by(lines) {
             let size = [lines.min(all - first), across];
@@ -112,13 +144,32 @@ impl Lower<'_, '_, '_> {
                 input_pitch: pitch,
                 output: before,
             }));
-            for p in 0..POINTS {
-                let matrix = |m: &Matrices| View::dense(Base::Arena(m.start + p * m.matrix), &[]);
-                let (rows, weights) =
-                    ([1, size[0] * size[1]], weights + p * packing.len(channels, columns));
-                self.gemm(&matrix(&before), rows, pitches, channels, &matrix(&after), |gemm| {
-                    Gemm { weights, columns, ..gemm }
-                })?;
+            for column in (0..columns).step_by(group) {
+                let columns = group.min(columns - column);
+                let start = match (weights, fresh) {
+                    (Points::Fresh(at), Some(output)) => {
+                        if first == 0 {
+                            let weights = at + 9 * packing.len(channels, column);
+                            let step = KernelsToPoints { channels, columns, weights, output };
+                            self.push(Step::KernelsToPoints(step));
+                        }
+                        Place::Arena(output)
+                    }
+                    (Points::Fresh(at) | Points::Made(at), _) => Place::Weights(at),
+                };
+                for p in 0..POINTS {
+                    let matrix = |m: &Matrices, column: usize| {
+                        View::dense(Base::Arena(m.start + p * m.matrix + column), &[])
+                    };
+                    let weights = start.beyond(p * packing.len(channels, columns));
+                    let (from, to) = (matrix(&before, 0), matrix(&after, column));
+                    let rows = [1, size[0] * size[1]];
+                    self.gemm(&from, rows, pitches, channels, &to, |gemm| Gemm {
+                        weights,
+                        columns,
+                        ..gemm
+                    })?;
+                }
             }
             self.push(Step::FromPoints(FromPoints {
                 size,
