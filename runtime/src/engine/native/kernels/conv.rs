@@ -41,80 +41,93 @@ pub unsafe fn depthwise<S: Simd>(s: &Depthwise, mem: Mem, part: Part) {
         if let Some(halo) = s.halo.as_ref().filter(|_| part.id == 0) {
             halo.clear(mem);
         }
-        match (s.taps.len(), s.swish) {
-            (9, false) => depthwise_of::<S, 9, false>(s, mem, part),
-            (25, false) => depthwise_of::<S, 25, false>(s, mem, part),
+        match (s.square(), s.swish) {
+            (3, false) => depthwise_of::<S, 3, false>(s, mem, part),
+            (5, false) => depthwise_of::<S, 5, false>(s, mem, part),
             (_, false) => depthwise_of::<S, 0, false>(s, mem, part),
-            (9, true) => depthwise_of::<S, 9, true>(s, mem, part),
-            (25, true) => depthwise_of::<S, 25, true>(s, mem, part),
+            (3, true) => depthwise_of::<S, 3, true>(s, mem, part),
+            (5, true) => depthwise_of::<S, 5, true>(s, mem, part),
             (_, true) => depthwise_of::<S, 0, true>(s, mem, part),
         }
     }
 }
 
-/// `T` is the number of taps, 0 when it is none of those with code of their own. Hard-swish is code of
-/// its own too: 25 weights leave no registers for constants that are not needed.
+impl Depthwise {
+    /// Lines and columns of a kernel whose taps are that many lines of as many, evenly spaced.
+    fn square(&self) -> usize {
+        let even = |&k: &usize| {
+            self.taps.len() == k * k
+                && (0..k * k).all(|t| self.taps[t] == t / k * self.taps[k] + t % k * self.taps[1])
+        };
+        [3, 5].into_iter().find(even).unwrap_or(0)
+    }
+}
+
+/// `K` is [`Depthwise::square`], or 0 for any taps. Hard-swish is code of its own too: 25 weights leave
+/// no registers for constants that are not needed.
 #[inline(always)]
-unsafe fn depthwise_of<S: Simd, const T: usize, const SWISH: bool>(
+unsafe fn depthwise_of<S: Simd, const K: usize, const SWISH: bool>(
     s: &Depthwise,
     mem: Mem,
     part: Part,
 ) {
+    /// Sums that do not wait for each other.
+    const ABREAST: usize = 3;
     let [height, width] = s.size;
-    let (low, high) = (s.clamp.0, s.clamp.1);
+    // Addresses from two distances: as many offsets as taps would have to be read from memory.
+    let [across, down] = if K == 0 { [0; 2] } else { [s.taps[1], s.taps[K]] };
     // SAFETY: the check covers all taps of all windows, and all channels.
     unsafe {
-        let (low, high) = (S::splat(low), S::splat(high));
+        let (low, high) = (S::splat(s.clamp.0), S::splat(s.clamp.1));
         let kernel = mem.weights.add(s.weights);
         let input = mem.at(s.input);
-        for y in part.of(height) {
-            let (line, out) = (input.add(y * s.input_pitch.y), s.output + y * s.output_pitch.y);
-            let out = mem.arena.add(out);
-            let mut channel = 0;
-            while channel < s.channels {
-                let n = (s.channels - channel).min(S::LANES);
-                let whole = n == S::LANES;
-                let load = |p: *const f32| if whole { S::load(p) } else { S::load_n(p, n) };
-                let bias = match s.bias {
-                    Some(at) => load(mem.weights.add(at + channel)),
-                    None => S::splat(0.0),
-                };
-                let mut weights = [bias; 32];
-                let mut offsets = [0; 32];
-                for t in 0..T {
-                    weights[t] = load(kernel.add(t * s.channels + channel));
-                    offsets[t] = *s.taps.get_unchecked(t);
+        // A vector of channels of all lines stays in the first-level cache, and so do its weights in
+        // registers.
+        let mut channel = 0;
+        while channel < s.channels {
+            let n = (s.channels - channel).min(S::LANES);
+            let whole = n == S::LANES;
+            let load = |p: *const f32| if whole { S::load(p) } else { S::load_n(p, n) };
+            let bias = match s.bias {
+                Some(at) => load(mem.weights.add(at + channel)),
+                None => S::splat(0.0),
+            };
+            let mut weights = [[bias; 5]; 5];
+            for ky in 0..K {
+                for kx in 0..K {
+                    weights[ky][kx] = load(kernel.add((ky * K + kx) * s.channels + channel));
                 }
+            }
+            for y in part.of(height) {
+                let line = input.add(y * s.input_pitch.y + channel);
+                let out = mem.arena.add(s.output + y * s.output_pitch.y + channel);
                 for x in 0..width {
-                    let window = line.add(x * s.input_pitch.x + channel);
-                    let mut sum = bias;
-                    if T == 0 {
+                    let window = line.add(x * s.input_pitch.x);
+                    let mut sums = [S::splat(0.0); ABREAST];
+                    sums[0] = bias;
+                    if K == 0 {
                         for (t, &offset) in s.taps.iter().enumerate() {
                             let w = load(kernel.add(t * s.channels + channel));
-                            sum = S::fma(load(window.add(offset)), w, sum);
+                            sums[0] = S::fma(load(window.add(offset)), w, sums[0]);
                         }
-                    } else {
-                        // Two sums, so that one does not wait for the other.
-                        let mut other = S::splat(0.0);
-                        for t in 0..T {
-                            let v = load(window.add(offsets[t]));
-                            if t % 2 == 0 {
-                                sum = S::fma(v, weights[t], sum);
-                            } else {
-                                other = S::fma(v, weights[t], other);
-                            }
-                        }
-                        sum = S::add(sum, other);
                     }
+                    for ky in 0..K {
+                        let taps = window.add(ky * down);
+                        for kx in 0..K {
+                            let sum = &mut sums[(ky * K + kx) % ABREAST];
+                            *sum = S::fma(load(taps.add(kx * across)), weights[ky][kx], *sum);
+                        }
+                    }
+                    let mut sum = S::add(S::add(sums[0], sums[1]), sums[2]);
                     if SWISH {
                         sum = hard_swish::<S>(sum);
                     }
-                    let y = S::at_most(high, S::at_least(low, sum));
-                    let at = out.add(x * s.output_pitch.x + channel);
-                    if whole { S::store(at, y) } else { S::store_n(at, y, n) }
+                    let v = S::at_most(high, S::at_least(low, sum));
+                    let at = out.add(x * s.output_pitch.x);
+                    if whole { S::store(at, v) } else { S::store_n(at, v, n) }
                 }
-                channel += n;
             }
+            channel += n;
         }
     }
 }
