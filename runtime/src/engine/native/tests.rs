@@ -2,6 +2,7 @@
 
 mod blocks;
 mod bytes;
+mod norms;
 mod points;
 
 use super::*;

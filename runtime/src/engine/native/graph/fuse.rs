@@ -84,13 +84,28 @@ impl<'g, 'a> Trace<'g, 'a> {
         self.maker(id).filter(|n| n.op == Op::Reshape).map(|n| n.inputs[0])
     }
 
-    /// Operand of a reduction of everything to one number.
+    /// Operand of a reduction of everything to one number, in one step or dimension by dimension.
     fn reduced(&self, id: ValueId, kind: Reduce) -> Option<ValueId> {
         if self.graph.shape(id).iter().any(|&n| n != 1) {
             return None;
         }
-        let node = self.maker(id)?;
-        matches!(&node.op, Op::Reduce { kind: k, .. } if *k == kind).then(|| node.inputs[0])
+        let step = |id: ValueId| {
+            let node = self.maker(id)?;
+            matches!(&node.op, Op::Reduce { kind: k, .. } if *k == kind).then(|| node.inputs[0])
+        };
+        let mut operand = step(id)?;
+        while let Some(before) = step(operand) {
+            operand = before;
+        }
+        Some(operand)
+    }
+
+    /// The tensor and the constant, if `id` is a tensor combined with one number per channel of a map.
+    fn with_channels(&self, id: ValueId, op: Binary) -> Option<(ValueId, ValueId)> {
+        let [a, b] = self.binary(id, op)?;
+        [(a, b), (b, a)].into_iter().find(|&(x, c)| {
+            self.graph.shape(x) == self.graph.shape(id) && per_channel(self.graph, c, id, true)
+        })
     }
 
     fn squared(&self, id: ValueId) -> Option<ValueId> {
@@ -139,30 +154,47 @@ fn attention(graph: &mut Graph<'_>) {
     }
 }
 
-/// Normalisation over all elements of a map, written out as reductions of a reshaped map.
+/// Normalisation over all elements of a map, written out as reductions of a reshaped map; gain and
+/// offset may come before it gets its shape back.
 fn map_norms(graph: &mut Graph<'_>) {
     let trace = Trace::new(graph);
     let mut found = Vec::new();
     for (i, node) in graph.nodes.iter().enumerate() {
-        let [1, _, _, _] = *graph.shape(node.output) else { continue };
+        let [1, channels, _, _] = *graph.shape(node.output) else { continue };
         let matched = || {
-            let x = trace.reshaped(node.output)?;
+            let mut x = trace.reshaped(node.output)?;
+            let mut inputs = Vec::new();
+            if graph.shape(x).get(1) == Some(&channels) {
+                let offset = trace.with_channels(x, Binary::Add);
+                let scaled = offset.map_or(x, |(scaled, _)| scaled);
+                if let Some((inner, gain)) = trace.with_channels(scaled, Binary::Mul) {
+                    x = inner;
+                    inputs.extend([Some(gain), offset.map(|(_, c)| c)].into_iter().flatten());
+                }
+            }
             let (source, op) = centred(&trace, x).or_else(|| scaled(&trace, x))?;
-            (graph.shape(source) == graph.shape(node.output)).then_some((source, op))
+            inputs.insert(0, source);
+            (graph.shape(source) == graph.shape(node.output)).then_some((inputs, op))
         };
-        if let Some((source, op)) = matched() {
-            found.push((i, source, op));
+        if let Some((inputs, op)) = matched() {
+            found.push((i, inputs, op));
         }
     }
-    for (i, source, op) in found {
+    for (i, inputs, op) in found {
         graph.nodes[i].op = op;
-        graph.nodes[i].inputs = vec![source];
+        graph.nodes[i].inputs = inputs;
     }
 }
 
-/// `d / sqrt(mean(d^2) + epsilon)`, `d = r - mean(r)`, `r` the reshaped map.
+/// `d / sqrt(mean(d^2) + epsilon)`, as quotient or as product with the reciprocal, `d = r - mean(r)`,
+/// `r` the reshaped map.
 fn centred(trace: &Trace<'_, '_>, id: ValueId) -> Option<(ValueId, Op)> {
-    let [d, deviation] = trace.binary(id, Binary::Div)?;
+    let product = || {
+        let [a, b] = trace.binary(id, Binary::Mul)?;
+        let inverse = |d, r| trace.unary(r, Unary::Reciprocal).map(|root| [d, root]);
+        inverse(a, b).or_else(|| inverse(b, a))
+    };
+    let [d, deviation] = trace.binary(id, Binary::Div).or_else(product)?;
     let (variance, epsilon) =
         trace.with_scalar(trace.unary(deviation, Unary::Sqrt)?, Binary::Add)?;
     if trace.squared(trace.reduced(variance, Reduce::Mean)?)? != d {
