@@ -130,9 +130,9 @@ impl Lower<'_, '_, '_> {
             }
             _ => columns,
         };
-        let fresh = match weights {
-            Points::Fresh(_) => Some(self.buffer(POINTS * packing.len(channels, group))),
-            Points::Made(_) => None,
+        let (packed, fresh) = match weights {
+            Points::Fresh(at) => (at, Some(self.buffer(POINTS * packing.len(channels, group)))),
+            Points::Made(at) => (at, None),
         };
         let pitches = (Pitch { y: 0, x: row_in }, Pitch { y: 0, x: row_out });
         for first in (0..all).step_by(lines) {
@@ -146,22 +146,22 @@ impl Lower<'_, '_, '_> {
             }));
             for column in (0..columns).step_by(group) {
                 let columns = group.min(columns - column);
-                let start = match (weights, fresh) {
-                    (Points::Fresh(at), Some(output)) => {
+                let ready = match fresh {
+                    Some(output) => {
                         if first == 0 {
-                            let weights = at + 9 * packing.len(channels, column);
+                            let weights = packed + 9 * packing.len(channels, column);
                             let step = KernelsToPoints { channels, columns, weights, output };
                             self.push(Step::KernelsToPoints(step));
                         }
                         Place::Arena(output)
                     }
-                    (Points::Fresh(at) | Points::Made(at), _) => Place::Weights(at),
+                    None => Place::Weights(packed),
                 };
                 for p in 0..POINTS {
                     let matrix = |m: &Matrices, column: usize| {
                         View::dense(Base::Arena(m.start + p * m.matrix + column), &[])
                     };
-                    let weights = start.beyond(p * packing.len(channels, columns));
+                    let weights = ready.beyond(p * packing.len(channels, columns));
                     let (from, to) = (matrix(&before, 0), matrix(&after, column));
                     let rows = [1, size[0] * size[1]];
                     self.gemm(&from, rows, pitches, channels, &to, |gemm| Gemm {
