@@ -9,12 +9,15 @@ Runs `tsda-train fit`, `tsda-export build`, `tsda eval` (RGB->T, T->RGB, Switch)
 split of the pairs as moving clips and of the clips, and `tsda-train align-report`, for each row and
 seed. A finished step is not repeated, an interrupted training goes on from its checkpoint: call it
 again. Rows are run in the order seed by seed, so that a stopped experiment has whole seeds.
-Writes OUT/results.json and OUT/table.md after every run.
+Writes OUT/results.json and OUT/table.md after every run. The last table is the difference of every
+row to CM on the same targets and seeds, with an interval by drawing pictures with replacement: targets
+of one picture are not independent.
 """
 
 import argparse
 import json
 import pathlib
+import random
 import statistics
 import subprocess
 import sys
@@ -129,6 +132,56 @@ def table(results):
     return "\n".join(lines + ["", spread, ""])
 
 
+def targets(out, row, seed, protocol):
+    """SR0.5 of every validation target, or nothing if that run is not there."""
+    summary = out / f"{row}-s{seed}" / "pairs" / "summary.json"
+    if not summary.exists():
+        return {}
+    found = json.loads(summary.read_text())["protocols"][protocol]["targets"]
+    return {name: figures["sr50"] for name, figures in found.items()}
+
+
+def interval(differences, draws=10_000):
+    """Mean of {target: difference} and its 95 % interval over pictures (`picture.number` are targets)."""
+    pictures = {}
+    for target, difference in differences.items():
+        pictures.setdefault(target.rsplit(".", 1)[0], []).append(difference)
+    sums = [(sum(d), len(d)) for d in pictures.values()]
+    dice, means = random.Random(1), []
+    for _ in range(draws):
+        drawn = dice.choices(sums, k=len(sums))
+        means.append(sum(s for s, _ in drawn) / sum(n for _, n in drawn))
+    means.sort()
+    mean = statistics.mean(differences.values())
+    return mean, means[int(0.025 * draws)], means[int(0.975 * draws) - 1]
+
+
+def against_cm(out, results):
+    """Table of the differences to CM, seed by seed on the same targets."""
+    seeds = {row: sorted(s for r, s in results if r == row) for row in ROWS}
+    lines = ["**Against CM** (validation pairs, SR0.5 in points, 95 % interval over pictures)", ""]
+    lines += ["| row | seeds | " + " | ".join(PROTOCOLS) + " | all three |", "|---|---:|" + "---:|" * 4]
+    for row in ROWS:
+        common = [s for s in seeds[row] if s in seeds["cm"]]
+        if row == "cm" or not common:
+            continue
+        cells, every = [], {}
+        for protocol in PROTOCOLS:
+            gained = {}
+            for seed in common:
+                base = targets(out, "cm", seed, protocol)
+                for name, value in targets(out, row, seed, protocol).items():
+                    gained.setdefault(name, []).append(100.0 * (value - base[name]))
+            gained = {name: statistics.mean(values) for name, values in gained.items()}
+            for name, value in gained.items():
+                every.setdefault(name, []).append(value)
+            cells.append(gained)
+        cells.append({name: statistics.mean(values) for name, values in every.items()})
+        texts = ["{:+.1f} ({:+.1f}..{:+.1f})".format(*interval(c)) if c else "-" for c in cells]
+        lines.append(f"| {row} | {len(common)} | " + " | ".join(texts) + " |")
+    return "\n".join(lines + [""])
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", type=pathlib.Path, required=True)
@@ -157,7 +210,8 @@ def main():
             print(f"{row} seed {seed}: " + json.dumps(results[row, seed]["sets"]), flush=True)
             ordered = list(results.values())
             (args.out / "results.json").write_text(json.dumps(ordered, indent=1) + "\n")
-            (args.out / "table.md").write_text(table(ordered))
+            text = table(ordered) + "\n" + against_cm(args.out, results)
+            (args.out / "table.md").write_text(text)
 
 
 if __name__ == "__main__":
