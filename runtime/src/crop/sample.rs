@@ -65,12 +65,12 @@ pub fn reference(
         }
         PixelFormat::Yuyv => {
             resample::<FOUR, FOUR>(window, spec, forward, out, |y, x, step, row| {
-                packed(line(y, 0, 2), x, step, row, |&[y0, u, y1, v]| ([y0, y1], u, v));
+                packed(line(y, 0, 2), x, step, row, |pair| pair);
             })
         }
         PixelFormat::Uyvy => {
             resample::<FOUR, FOUR>(window, spec, forward, out, |y, x, step, row| {
-                packed(line(y, 0, 2), x, step, row, |&[u, y0, v, y1]| ([y0, y1], u, v));
+                packed(line(y, 0, 2), x, step, row, |[u, y0, v, y1]| [y0, u, y1, v]);
             })
         }
         PixelFormat::Nv12 => {
@@ -79,7 +79,8 @@ pub fn reference(
                 let (luma, chroma) = (line(y, 0, 1), &data[chroma + y / 2 * stride..]);
                 for (i, pixel) in row.as_chunks_mut().0.iter_mut().enumerate() {
                     let x = x + i * step;
-                    *pixel = rgb(luma[x], &Chroma::new(chroma[x / 2 * 2], chroma[x / 2 * 2 + 1]));
+                    let [u, v] = [0, 1].map(|i| f32::from(chroma[x / 2 * 2 + i]));
+                    [*pixel, _] = rgb_pair([luma[x].into(), u, 0.0, v]);
                 }
             });
         }
@@ -122,57 +123,47 @@ fn triples(line: &[u8], step: usize, row: &mut [f32]) {
     }
 }
 
-/// Every `step`-th pixel from `x` on of a row of pairs, `split` into both lumas, U and V.
+/// Every `step`-th pixel from `x` on of a row of pairs, each in the `order` Y, U, Y, V.
 fn packed(
     line: &[u8],
     x: usize,
     step: usize,
     row: &mut [f32],
-    split: impl Fn(&[u8; 4]) -> ([u8; 2], u8, u8),
+    order: impl Fn([f32; 4]) -> [f32; 4],
 ) {
     let pixels: &mut [[f32; FOUR]] = row.as_chunks_mut().0;
-    let pairs = line.as_chunks().0;
-    if step > 1 {
-        for (i, pixel) in pixels.iter_mut().enumerate() {
-            let x = x + i * step;
-            let (luma, u, v) = split(&pairs[x / 2]);
-            *pixel = rgb(luma[x % 2], &Chroma::new(u, v));
-        }
-        return;
-    }
-    // Two pixels share their chroma.
-    let odd = (x % 2).min(pixels.len());
+    let pairs: &[[u8; 4]] = line.as_chunks().0;
+    let both = |pair: &[u8; 4]| rgb_pair(order(pair.map(f32::from)));
+    // Single pixels: all of them, or those at the ends whose neighbour is not wanted.
+    let odd = if step > 1 { pixels.len() } else { (x % 2).min(pixels.len()) };
     let (head, rest) = pixels.split_at_mut(odd);
-    if let [pixel] = head {
-        let (luma, u, v) = split(&pairs[x / 2]);
-        *pixel = rgb(luma[1], &Chroma::new(u, v));
+    for (i, pixel) in head.iter_mut().enumerate() {
+        let x = x + i * step;
+        *pixel = both(&pairs[x / 2])[x % 2];
     }
-    for (pixels, pair) in rest.chunks_mut(2).zip(&pairs[(x + odd) / 2..]) {
-        let (luma, u, v) = split(pair);
-        let chroma = Chroma::new(u, v);
-        for (pixel, luma) in pixels.iter_mut().zip(luma) {
-            *pixel = rgb(luma, &chroma);
-        }
+    let (twos, tail) = rest.as_chunks_mut();
+    let mut pairs = pairs[(x + odd) / 2..].iter();
+    for (two, pair) in twos.iter_mut().zip(&mut pairs) {
+        *two = both(pair);
     }
-}
-
-/// What U and V add to red, green and blue; green gets both.
-struct Chroma([[f32; FOUR]; 2]);
-
-impl Chroma {
-    fn new(u: u8, v: u8) -> Self {
-        let (u, v) = (f32::from(u) - 128.0, f32::from(v) - 128.0);
-        Self([
-            [1.596_026_8 * v, -0.391_762_3 * u, 2.017_232_2 * u, 0.0],
-            [0.0, -0.812_967_65 * v, 0.0, 0.0],
-        ])
+    if let ([pixel], Some(pair)) = (tail, pairs.next()) {
+        *pixel = both(pair)[0];
     }
 }
 
-/// BT.601 limited range to 0..255, real-valued.
-fn rgb(luma: u8, Chroma([first, second]): &Chroma) -> [f32; FOUR] {
-    let y = 1.164_383_6 * (f32::from(luma) - 16.0);
-    core::array::from_fn(|c| (y + first[c] + second[c]).clamp(0.0, 255.0))
+/// BT.601 limited range to 0..255, real-valued: two pixels of the numbers Y, U, Y, V. Every step is one
+/// operation on four numbers.
+fn rgb_pair(pair: [f32; 4]) -> [[f32; FOUR]; 2] {
+    const ZERO: [f32; 4] = [16.0, 128.0, 16.0, 128.0];
+    const GAIN: [f32; 4] = [1.164_383_6, 1.0, 1.164_383_6, 1.0];
+    /// What U or V adds to red, green and blue, and what V adds to green besides.
+    const CHROMA: [[f32; FOUR]; 2] =
+        [[1.596_026_8, -0.391_762_3, 2.017_232_2, 0.0], [0.0, -0.812_967_65, 0.0, 0.0]];
+    let [y0, u, y1, v]: [f32; 4] = core::array::from_fn(|i| (pair[i] - ZERO[i]) * GAIN[i]);
+    let sources = [[v, u, u, u], [v; 4]];
+    let [first, second]: [[f32; FOUR]; 2] =
+        core::array::from_fn(|i| core::array::from_fn(|c| sources[i][c] * CHROMA[i][c]));
+    [y0, y1].map(|y| core::array::from_fn(|c| (y + first[c] + second[c]).clamp(0.0, 255.0)))
 }
 
 /// A row of the picture resampled to a stripe's columns.
