@@ -59,6 +59,7 @@ pub fn reference(
             let gain = 255.0 / (high - low).max(1.0);
             resample::<1, 1>(window, spec, forward, out, |y, x, step, row| {
                 each(line(y, x, 2), step, row, |&raw| {
+                    // Not `clamp`: its check of the limits keeps this from being vector code.
                     (f32::from(u16::from_le_bytes(raw)).max(low).min(high) - low) * gain
                 });
             });
